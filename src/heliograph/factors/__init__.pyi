@@ -23,13 +23,11 @@ from .diffuse_gaussian import observe_diffuse as observe_diffuse
 from .diffuse_gaussian import predict_diffuse as predict_diffuse
 from .diffuse_gaussian import project_diffuse as project_diffuse
 from .diffuse_gaussian import start_diffuse as start_diffuse
-from .factored_gaussian import BackwardGain as BackwardGain
 from .factored_gaussian import Gaussian as Gaussian
 from .factored_gaussian import Image as Image
 from .factored_gaussian import Innovations as Innovations
 from .factored_gaussian import add_noise_to_image as add_noise_to_image
 from .factored_gaussian import append_rows as append_rows
-from .factored_gaussian import condition_on_next_state as condition_on_next_state
 from .factored_gaussian import condition_on_observation as condition_on_observation
 from .factored_gaussian import correct_by_gain as correct_by_gain
 from .factored_gaussian import from_columns as from_columns
@@ -41,7 +39,6 @@ from .factored_gaussian import impose_moments_of_combination as impose_moments_o
 from .factored_gaussian import merge_mixture as merge_mixture
 from .factored_gaussian import moments_of_mixture as moments_of_mixture
 from .factored_gaussian import predict_affine as predict_affine
-from .factored_gaussian import rts_step as rts_step
 from .factored_gaussian import sum_unexplained as sum_unexplained
 from .factored_gaussian import take_leading as take_leading
 from .gaussian_on_group import settle as settle
@@ -60,3 +57,6 @@ from .square_root_update import covariance_of_root as covariance_of_root
 from .square_root_update import observe_information as observe_information
 from .square_root_update import observe_root as observe_root
 from .square_root_update import roots_of as roots_of
+from .state_given_next import BackwardGain as BackwardGain
+from .state_given_next import condition_on_next_state as condition_on_next_state
+from .state_given_next import rts_step as rts_step

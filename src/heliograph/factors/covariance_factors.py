@@ -43,27 +43,30 @@ class WeightedColumns(NamedTuple):
 
     @property
     def diagonal(self) -> jax.Array:
-        """Diagonal of the covariance: variances (n,)."""
+        """Variances (n,): the diagonal of W diag(w) W', without forming the matrix."""
         variances: jax.Array = jnp.asarray(self.matrix) ** 2 @ self.weights
         return variances
 
     def through(self, matrix: Array) -> "WeightedColumns":
-        """Return the covariance of A v for a v with this one."""
+        """Return the covariance of A v, for a v with this covariance: the columns A W with the same weights."""
         return WeightedColumns(matrix @ self.matrix, self.weights)
 
     def times(self, factor: Array) -> "WeightedColumns":
-        """Return the covariance times a number."""
+        """Return the covariance times a number `factor`: the same columns, with weights times it."""
         return WeightedColumns(self.matrix, self.weights * factor)
 
 
 def join_columns(*covariances: WeightedColumns) -> WeightedColumns:
-    """Add covariances: their columns side by side."""
+    """Return the sum of covariances W diag(w) W': their columns side by side, in one matrix."""
     matrix = jnp.concatenate([jnp.asarray(covariance.matrix) for covariance in covariances], axis=1)
     return WeightedColumns(matrix, jnp.concatenate([jnp.asarray(covariance.weights) for covariance in covariances]))
 
 
 def side_by_side(parts: WeightedColumns, weights: Array) -> WeightedColumns:
-    """Return the columns of sum_i w_i P_i: `parts` has those of each P_i (i, n, columns), and `weights` are w_i."""
+    """Return the columns of sum_i w_i P_i, such as the mean of covariances P_i over modes of probability w_i.
+
+    `parts` has the columns of each P_i along a first axis (i, n, columns), and `weights` (i,) are w_i.
+    """
     matrix = jnp.asarray(parts.matrix)
     columns = jnp.moveaxis(matrix, 0, 1).reshape(matrix.shape[1], -1)
     scaled_weights = (jnp.asarray(weights)[:, None] * parts.weights).reshape(-1)
@@ -71,7 +74,7 @@ def side_by_side(parts: WeightedColumns, weights: Array) -> WeightedColumns:
 
 
 def zero_covariance(n: int) -> WeightedColumns:
-    """Return the covariance of zero of n components: no columns."""
+    """Return the covariance of n components that are known: (n, 0), a matrix without columns."""
     return WeightedColumns(np.zeros((n, 0)), np.zeros(0))
 
 
@@ -86,11 +89,14 @@ def unit_lower(entries: Array) -> Any:
 
 @cache_arrays
 def _place_unit_lower(count: int) -> np.ndarray:
-    """Return for each number of L (n, n) its index in the list of `count` entries below the diagonal, a 0 and a 1."""
+    """Return for each number of L (n, n) its index in a list: `count` entries below the diagonal, then a 0, then a 1.
+
+    Entries are listed row by row. Numbers above the diagonal are the 0, those on it the 1.
+    """
     n = (1 + int(np.sqrt(1 + 8 * count))) // 2  # of count = n (n - 1) / 2
-    index = np.full((n, n), count)
+    index = np.full((n, n), count)  # the 0
     index[np.tril_indices(n, -1)] = np.arange(count)
-    np.fill_diagonal(index, count + 1)
+    np.fill_diagonal(index, count + 1)  # the 1
     return index
 
 
@@ -101,8 +107,11 @@ def below_diagonal(lower: jax.Array) -> jax.Array:
 
 
 def _take_entries(entries: jax.Array, indices: np.ndarray) -> jax.Array:
-    """Return `entries[..., indices]` as one operation: the indices are known, and need no check of their bounds."""
-    axis = entries.ndim - 1
+    """Return `entries[..., indices]` as one operation: the indices are known, and need no check of their bounds.
+
+    `entries` is (..., count) and `indices` an array of integers; the result is (..., *indices.shape).
+    """
+    axis = entries.ndim - 1  # the entries' axis: indexed, and replaced by those of the indices; all others are kept
     numbers = lax.GatherDimensionNumbers(tuple(range(axis)), (axis,), (axis,))
     sizes = (*entries.shape[:-1], 1)
     return lax.gather(entries, indices[..., None], numbers, sizes, mode=lax.GatherScatterMode.CLIP)
@@ -123,7 +132,10 @@ def triangularise(columns: WeightedColumns) -> WeightedColumns:
 
 
 def _triangularise_row_by_row(columns: WeightedColumns) -> WeightedColumns:
-    """Return L and d with L diag(d) L' = A diag(w) A', by weighted Gram-Schmidt, one row of A after another."""
+    """Return L and d with L diag(d) L' = A diag(w) A', by weighted Gram-Schmidt, one row of A after another.
+
+    d_j is the square of row j in the weights, after the rows below lost their parts along the rows above.
+    """
     rows, weights = jnp.asarray(columns.matrix), jnp.asarray(columns.weights)
     n, lower, variances = len(rows), [], []
     for j in range(n):
@@ -154,14 +166,19 @@ def add_columns_to_factors(factors: WeightedColumns, columns: WeightedColumns) -
     flat_place = {(i, j): e for e, (i, j) in enumerate(zip(rows.tolist(), places.tolist(), strict=True))}
 
     def absorb(carry: tuple[jax.Array, jax.Array], column: tuple[jax.Array, jax.Array]) -> tuple[Any, None]:
-        """Return the factors of L diag(d) L' + w c c', (c, w) = `column`. Row j takes c_j L_ij off each c_i below."""
-        (lower, variances), (c, weight) = map(list, carry), (list(column[0]), column[1])
-        # Row j takes its part of the column: d_j' = d_j + w c_j^2, s = d_j / d_j', g = w c_j / d_j'
+        """Absorb one column c of weight w: return the factors of L diag(d) L' + w c c'.
+
+        `carry` holds the entries of L below its diagonal and d, `column` holds c and w.
+        """
+        lower, variances = list(carry[0]), list(carry[1])
+        c, weight = list(column[0]), column[1]
+        # Row after row takes its part of the column: d_j' = d_j + w c_j^2, s = d_j / d_j', g = w c_j / d_j'
         # (1 and 0 if d_j' = 0).
         for j in range(n):
             d = variances[j] + weight * c[j] ** 2
             reciprocal = reciprocal_or_one(d)
-            s, g = jnp.where(is_positive(d), variances[j] * reciprocal, 1.0), weight * c[j] * reciprocal
+            s = jnp.where(is_positive(d), variances[j] * reciprocal, 1.0)
+            g = weight * c[j] * reciprocal
             variances[j] = d
             for i in range(j + 1, n):
                 e = flat_place[i, j]  # of L_ij among the entries
@@ -248,7 +265,10 @@ def factor_known_covariance(covariance: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def columns_of(covariance: Array) -> WeightedColumns:
-    """Return W and w of P = W diag(w) W': as many columns as P's rank if P is known (NumPy), else n columns."""
+    """Return columns W and weights w of a covariance P = W diag(w) W' (n, n).
+
+    Of a NumPy array, whose numbers are known, there are as many columns as its rank; of a traced one n, by elimination.
+    """
     if isinstance(covariance, np.ndarray):
         root = find_covariance_root(covariance)
         return WeightedColumns(root, np.ones(root.shape[1]))
@@ -308,13 +328,16 @@ def noise_beside_repeated(sizes: Array) -> Array:
 
 
 def column_below_diagonal(j: int, column: jax.Array) -> jax.Array:
-    """Return column j of L without its diagonal: the entries below it, zeros above."""
+    """Return column j of L - I, L unit lower triangular: the entries of `column` (n,) below row j, zeros elsewhere."""
     n = len(column)
     return lax.select(np.arange(n) > j, lax.reshape(column, (n,)), jnp.zeros(n, column.dtype))
 
 
 def assemble_factors(lower: list[jax.Array], variances: list[jax.Array], dtype: np.dtype[Any]) -> WeightedColumns:
-    """Return L and d from the columns of L - I, which are 0 on and above the diagonal, and the entries of d."""
+    """Return L and d, as a covariance L diag(d) L', from a list of the columns of L - I and one of the entries of d.
+
+    A factorisation finds both one by one. The columns (n,) are 0 on and above the diagonal.
+    """
     n = len(variances)
     if not n:
         return WeightedColumns(jnp.zeros((0, 0), dtype), jnp.zeros(0, dtype))
@@ -367,6 +390,10 @@ _eliminate_by_loop = operation(_eliminate_column_by_column)(_eliminate_in_loop)
 def insert_column(
     j: jax.Array, lower: jax.Array, column: jax.Array, variances: jax.Array, d: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Return L with `column` as its column j, below the diagonal, and `variances` with d in entry j."""
+    """Return L (n, n) with `column` added to its column j, and `variances` (n,) with d in entry j.
+
+    A step of a factorisation in a loop, where j is traced: column j of `lower` was that of the identity, and `column`
+    (n,) is 0 on and above the diagonal.
+    """
     is_j = np.arange(len(variances)) == j
     return jnp.where(is_j, lower + column[:, None], lower), jnp.where(is_j, d, variances)

@@ -12,9 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.factors.covariance_factors import WeightedColumns, below_diagonal, decorrelate, unit_lower
-from heliograph.factors.factored_gaussian import BackwardGain, Gaussian
+from heliograph.factors.factored_gaussian import Gaussian
 from heliograph.factors.pivots import reciprocal_or_zero
 from heliograph.factors.repeated_measurements import triangularise_noise
+from heliograph.factors.state_given_next import BackwardGain
 from heliograph.numerics.gaussian_density import LOG_TURN
 from heliograph.numerics.trace_settings import writes_for_derivatives
 from heliograph.numerics.types import Float
@@ -41,7 +42,7 @@ class Diffuse(NamedTuple):
 
     @property
     def unknown(self) -> jax.Array:
-        """Return which components have an infinite variance, (n,)."""
+        """Return which components have an infinite variance (n,): those with an entry of L in an unknown direction."""
         return jnp.any((self.root != 0) & (self.infinite > 0), axis=1)
 
     @property
@@ -79,7 +80,10 @@ def _find_slopes(matrix: jax.Array, x: Diffuse) -> jax.Array:
 
 
 class FiniteAndInfiniteWeights(NamedTuple):
-    """Weights of columns (c,): finite ones, and infinite ones."""
+    """Variances of the sources in whose directions columns point, (c,) each: for each source one of the two is 0.
+
+    A source of weight `finite` w has the variance w; one of weight `infinite` w has kappa w, with kappa to infinity.
+    """
 
     finite: jax.Array
     infinite: jax.Array
@@ -108,12 +112,13 @@ def triangularise_both_levels(
     whole = rows**2 @ weights.infinite if whole is None else whole
     columns, finite, infinite, numbers = [], [], [], np.arange(len(rows))
     for j in range(count):
-        # s over the infinite columns, which counts as rounding up to the share FALLEN of the row's first square.
+        # s over the infinite columns: up to the share FALLEN (1e-12) of its value before any subtraction, it is
+        # rounding, and the row depends on no infinite column any more.
         infinite_s = rows[j] ** 2 @ weights.infinite
         is_infinite = infinite_s > FALLEN * whole[j]
         row = jnp.where((weights.infinite > 0) & ~is_infinite, 0.0, rows[j])
         finite_s = row**2 @ weights.finite
-        # Column j of L: L_ij = (row i, row j) / s.
+        # Column j of L: L_ij = (row i, row j) / s, over the columns that count for row j.
         weighted = jnp.where(is_infinite, weights.infinite, weights.finite) * row
         along = rows @ weighted * reciprocal_or_zero(jnp.where(is_infinite, infinite_s, finite_s))
         column = jnp.where(numbers == j, 1.0, jnp.where(numbers > j, along, 0.0))
@@ -125,30 +130,33 @@ def triangularise_both_levels(
 
 
 def start_diffuse(mean: jax.Array, known: WeightedColumns, unknown: np.ndarray) -> Diffuse:
-    """Return the law of a state with some unknown components, whose variance is infinite.
+    """Return the law of a state of which nothing is known in some components: their variance is infinite.
+
+    The result holds the factors of the covariance L (diag(d) + kappa diag(d_inf)) L' for kappa to infinity.
 
     Args:
         mean: of the state (n,).
-        known: columns and weights of the covariance of the known components.
+        known: columns W (n, c) and weights w (c,) of the covariance W diag(w) W' of the known components.
         unknown: which components are unknown (n,), as flags or as 0 and 1.
     """
     n = len(mean)
-    # Unit columns, with an infinite weight where unknown, then the columns of the known covariance, with finite
-    # weights.
+    # x - mean = [I | W] sources: source e_i of infinite variance for each unknown component i (0 for a known one), and
+    # the sources of the known covariance W diag(w) W', of finite variances w.
     rows = jnp.concatenate([jnp.eye(n), jnp.asarray(known.matrix)], axis=1)
     finite = jnp.concatenate([jnp.zeros(n), jnp.asarray(known.weights)])
     infinite = jnp.concatenate([jnp.asarray(unknown, float), jnp.zeros(known.matrix.shape[1])])
     weights = FiniteAndInfiniteWeights(finite, infinite)
-    lower, levels, _ = triangularise_both_levels(rows, weights, n)
+    lower, levels, _ = triangularise_both_levels(rows, weights, n)  # L, and (d, d_inf)
     return Diffuse(jnp.asarray(mean), below_diagonal(lower), *levels)
 
 
 def predict_diffuse(x: Diffuse, matrix: jax.Array, offset: jax.Array, noise: WeightedColumns) -> Diffuse:
     """Predict x over x+ = F x + b + w: F is `matrix`, b the `offset`, `noise` columns of Cov w.
 
-    The covariance has two levels, a finite one and an infinite one. Both are predicted.
+    The covariance of x has a finite part and an infinite one (of unknown directions). Both are predicted: for
+    x = m + L xi, x+ - E x+ = [F L | N] (xi, omega), whose rows are made orthogonal by Gram-Schmidt.
     """
-    rows, weights = _append_noise_columns(_find_slopes(matrix, x), x, noise)
+    rows, weights = _append_noise_columns(_find_slopes(matrix, x), x, noise)  # [F L | N], variances of (xi, omega)
     lower, levels, _ = triangularise_both_levels(rows, weights, len(x.mean))
     return Diffuse(matrix @ x.mean + offset, below_diagonal(lower), *levels)
 
@@ -247,12 +255,31 @@ def _decorrelate_measurement(
     return state, rows, jnp.where(present, 0.0, 1.0)
 
 
+class _Column(NamedTuple):
+    """A direction L_j (n,) of x = m + L xi, and the variance of xi_j: d_j, or kappa d_inf,j; one of the two is 0."""
+
+    vector: jax.Array
+    d: jax.Array
+    d_inf: jax.Array
+
+
+class _MeasuredSums(NamedTuple):
+    """Sums for a scalar z = h'x + v over the columns k of L that were measured, with f_k = h'L_k.
+
+    s = Var v + sum f_k^2 d_k and s_inf = sum f_k^2 d_inf,k are the finite and the infinite part of Var z, and `cross`
+    (n,) is Cov(x, z). Once s_inf > 0, finite parts are nothing beside it: s stays, and `cross` is the infinite part.
+    """
+
+    s: jax.Array
+    s_inf: jax.Array
+    cross: jax.Array
+
+
 def _observe_scalar(x: Diffuse, h: jax.Array, noise: jax.Array) -> tuple[Diffuse, jax.Array, jax.Array, jax.Array]:
     """Condition x on one number z = h'x + v, Var v = `noise`, where some directions of x are unknown.
 
     The covariance of x is L diag(d + kappa d_inf) L', kappa -> infinity: column j of L is an unknown direction where
-    d_inf,j > 0, and then d_j = 0. Bierman's steps go over the columns of L from the last to the first; f_j = h'L_j is
-    what z shows of column j. What has a factor kappa is the infinite part, and outweighs the finite one.
+    d_inf,j > 0, and then d_j = 0. Bierman's update goes over the columns of L from the last to the first.
 
     Returns:
         x given z, its mean as it was; the gain (n,) by which the innovation moves the mean; the variance of z, or its
@@ -261,40 +288,54 @@ def _observe_scalar(x: Diffuse, h: jax.Array, noise: jax.Array) -> tuple[Diffuse
     Source: Bierman, Factorization methods for discrete sequential estimation (1977), for finite and infinite parts.
     """
     n, root = len(x.mean), x.root
-    # Sums over the columns k > j, which are done: s = noise + sum f_k^2 d_k, s_inf = sum f_k^2 d_inf,k, and `cross`,
-    # the covariance of x with z. Once z shows an unknown direction, `cross` is of the infinite part alone.
-    s, s_inf, cross = noise, jnp.zeros_like(noise), jnp.zeros(n)
-    columns, d, d_inf = [root[:, j] for j in range(n)], list(x.variances), list(x.infinite)
+    vectors = [root[:, j] for j in range(n)]
+    columns = [_Column(*column) for column in zip(vectors, x.variances, x.infinite, strict=True)]
+    sums = _MeasuredSums(s=noise, s_inf=jnp.zeros_like(noise), cross=jnp.zeros(n))
     for j in reversed(range(n)):
-        column = columns[j]
-        f, size_of_terms = h @ column, jnp.abs(h) @ jnp.abs(column)
-        is_unknown, is_shown = d_inf[j] > 0, jnp.abs(f) > DEAF * size_of_terms
-        shows_unknown = is_unknown & is_shown
-        is_first_unknown = shows_unknown & (s_inf == 0)
-        # The sum that counts: the infinite part once z shows an unknown direction, before it the finite one.
-        leading_s = jnp.where(s_inf > 0, s_inf, s)
-        # L_j - (f_j / s_{j+1}) cross_{j+1}; the slope f of an unknown direction that z does not show is rounding.
-        taken = jnp.where(is_unknown & ~is_shown, 0.0, f * reciprocal_or_zero(leading_s) * cross)
-        # A component that z determines has no part in an unknown direction: its entry is 0, not rounding times an
-        # infinite weight.
-        rounding = DEAF * (jnp.abs(column) + jnp.abs(taken))
-        is_left = ~is_unknown | is_first_unknown | (jnp.abs(column - taken) > rounding)
-        columns[j] = jnp.where(is_left, column - taken, 0.0)
-        next_s = s + jnp.where(is_unknown, 0.0, f**2 * d[j])
-        next_s_inf = s_inf + jnp.where(shows_unknown, f**2 * d_inf[j], 0.0)
-        # Beside an unknown direction that z shows, finite variances are nothing.
-        finite_part = jnp.where(is_unknown | (s_inf > 0), 0.0, d[j] * f)
-        cross = jnp.where(is_first_unknown, 0.0, cross) + column * jnp.where(shows_unknown, d_inf[j] * f, finite_part)
-        # d_j s_{j+1} / s_j, of either part; the first unknown direction that z shows has the variance s / f^2 after it.
-        # As long as s_j is 0, z shows nothing.
-        shrunk = jnp.where((s_inf > 0) | (next_s == 0), d[j], d[j] * s * reciprocal_or_zero(next_s))
-        d[j] = jnp.where(is_unknown, jnp.where(is_first_unknown, s * reciprocal_or_zero(f**2), 0.0), shrunk)
-        shrunk_inf = jnp.where(shows_unknown, d_inf[j] * s_inf * reciprocal_or_zero(next_s_inf), d_inf[j])
-        d_inf[j] = jnp.where(is_first_unknown, 0.0, shrunk_inf)
-        s, s_inf = jnp.where(s_inf > 0, s, next_s), next_s_inf
-    variance = jnp.where(s_inf > 0, s_inf, s)
-    observed = Diffuse(x.mean, below_diagonal(jnp.stack(columns, axis=1)), jnp.stack(d), jnp.stack(d_inf))
-    return observed, cross * reciprocal_or_zero(variance), variance, s_inf > 0
+        columns[j], sums = _measure_along_column(columns[j], h, sums)
+    observed = Diffuse(
+        mean=x.mean,
+        lower=below_diagonal(jnp.stack([column.vector for column in columns], axis=1)),
+        variances=jnp.stack([column.d for column in columns]),
+        infinite=jnp.stack([column.d_inf for column in columns]),
+    )
+    shows_unknown = sums.s_inf > 0
+    variance = jnp.where(shows_unknown, sums.s_inf, sums.s)
+    gain = sums.cross * reciprocal_or_zero(variance)
+    return observed, gain, variance, shows_unknown
+
+
+def _measure_along_column(column: _Column, h: jax.Array, sums: _MeasuredSums) -> tuple[_Column, _MeasuredSums]:
+    """Take column j of L into the measurement z = h'x + v; return it given z, and the sums with its terms.
+
+    With f = h'L_j, and `sums` s, s_inf, cross over the columns behind it, Bierman's step for a known direction is
+    L_j -= (f / s) cross, s' = s + f^2 d_j, cross' = cross + d_j f L_j, d_j *= s / s'. For an unknown direction that z
+    shows it is the same with d_inf,j and s_inf. The first such direction becomes known: its variance is s / f^2.
+    """
+    vector, d, d_inf = column
+    s, s_inf, cross = sums
+    f, size_of_terms = h @ vector, jnp.abs(h) @ jnp.abs(vector)
+    is_unknown, is_shown = d_inf > 0, jnp.abs(f) > DEAF * size_of_terms  # an f of less is rounding
+    shows_unknown = is_unknown & is_shown
+    is_first_unknown = shows_unknown & (s_inf == 0)
+    # (f / s) cross, where s_inf stands for s as soon as z shows an unknown direction.
+    leading_s = jnp.where(s_inf > 0, s_inf, s)
+    taken = jnp.where(is_unknown & ~is_shown, 0.0, f * reciprocal_or_zero(leading_s) * cross)
+    # An entry of an unknown direction of which only rounding is left is 0: it would get an infinite variance.
+    rounding = DEAF * (jnp.abs(vector) + jnp.abs(taken))
+    is_left = ~is_unknown | is_first_unknown | (jnp.abs(vector - taken) > rounding)
+    vector_given_z = jnp.where(is_left, vector - taken, 0.0)
+    # The sums with column j.
+    next_s = s + jnp.where(is_unknown, 0.0, f**2 * d)
+    next_s_inf = s_inf + jnp.where(shows_unknown, f**2 * d_inf, 0.0)
+    finite_part = jnp.where(is_unknown | (s_inf > 0), 0.0, d * f)
+    next_cross = jnp.where(is_first_unknown, 0.0, cross) + vector * jnp.where(shows_unknown, d_inf * f, finite_part)
+    # d_j s / s', of either part. As long as s' is 0, z shows nothing.
+    shrunk = jnp.where((s_inf > 0) | (next_s == 0), d, d * s * reciprocal_or_zero(next_s))
+    d_given_z = jnp.where(is_unknown, jnp.where(is_first_unknown, s * reciprocal_or_zero(f**2), 0.0), shrunk)
+    shrunk_inf = jnp.where(shows_unknown, d_inf * s_inf * reciprocal_or_zero(next_s_inf), d_inf)
+    given_z = _Column(vector_given_z, d_given_z, jnp.where(is_first_unknown, 0.0, shrunk_inf))
+    return given_z, _MeasuredSums(s=jnp.where(s_inf > 0, s, next_s), s_inf=next_s_inf, cross=next_cross)
 
 
 def condition_on_next_diffuse(x: Diffuse, matrix: jax.Array, ahead: jax.Array, noise: WeightedColumns) -> BackwardGain:
@@ -330,5 +371,8 @@ def condition_on_next_diffuse(x: Diffuse, matrix: jax.Array, ahead: jax.Array, n
 
 
 def as_gaussian(x: Diffuse) -> Gaussian:
-    """Return x as a Gaussian in which an unknown direction has the variance NaN instead of infinity."""
+    """Return x as an ordinary Gaussian, whose variance is NaN in each direction that is unknown.
+
+    For code that knows no infinite variances: what depends on an unknown direction is then NaN too.
+    """
     return Gaussian(x.mean, x.lower, jnp.where(x.infinite > 0, jnp.nan, x.variances))

@@ -25,12 +25,11 @@ from heliograph.factors.covariance_factors import (
     zero_covariance,
 )
 from heliograph.factors.noise_columns import measure_beside_noises, measure_uncorrelated
-from heliograph.factors.pivots import reciprocal_or_one, reciprocal_or_zero, rounding_of_pivots, spoils_what_is_known
-from heliograph.factors.repeated_measurements import rounding_of_products, rounding_of_slopes, triangularise_noise
+from heliograph.factors.pivots import reciprocal_or_one, reciprocal_or_zero, rounding_of_pivots
+from heliograph.factors.repeated_measurements import rounding_of_slopes, triangularise_noise
 from heliograph.factors.scalar_update import (
     update_by_parts,
     update_by_row,
-    update_by_scalar_given_products,
     update_root_columns,
 )
 from heliograph.numerics.gaussian_density import LOG_TURN
@@ -73,13 +72,19 @@ class Gaussian(NamedTuple):
 
 
 def from_columns(mean: jax.Array, columns: WeightedColumns) -> Gaussian:
-    """Return the Gaussian of a covariance that is a sum of squares W diag(w) W', by orthogonal rows: exact to eps^2."""
+    """Return the Gaussian of this mean (n,) and the covariance W diag(w) W' given by its columns W and weights w.
+
+    The rows of W are made orthogonal (Gram-Schmidt), and W diag(w) W' is never formed: exact to eps^2.
+    """
     factors = triangularise(columns)
     return Gaussian(mean, below_diagonal(factors.matrix), factors.weights)
 
 
 def from_summed_covariance(mean: jax.Array, *covariances: WeightedColumns) -> Gaussian:
-    """Return the Gaussian of the summed covariances, by elimination: faster than orthogonal rows, less exact."""
+    """Return the Gaussian whose covariance is the sum of these, each given by its columns W diag(w) W'.
+
+    The sum is formed as a matrix and factored by elimination: faster than making rows orthogonal, and less exact.
+    """
     covariance = covariances[0].covariance
     for columns in covariances[1:]:
         covariance = covariance + columns.covariance
@@ -87,7 +92,11 @@ def from_summed_covariance(mean: jax.Array, *covariances: WeightedColumns) -> Ga
 
 
 def from_covariance_by_elimination(mean: jax.Array, covariance: jax.Array) -> Gaussian:
-    """Return the Gaussian of a covariance computed as a sum of squares, by elimination, with pivots >= n eps P_jj."""
+    """Return the Gaussian of this mean (n,) and covariance P (n, n), factored by elimination.
+
+    Rounding may make a pivot too small or negative: each is raised to at least n eps P_jj. P must have been computed as
+    a sum of squares, so that no more than rounding is wrong with it.
+    """
     factors = eliminate(covariance, rounding_of_pivots(covariance))
     return Gaussian(mean, below_diagonal(factors.matrix), factors.weights)
 
@@ -134,12 +143,21 @@ class Image(NamedTuple):
 
     @property
     def columns(self) -> WeightedColumns:
-        """Covariance of f(x), as columns with their weights."""
+        """Covariance of f(x): the columns of S diag(d) S' and of Cov c side by side."""
         return join_columns(self.explained, self.curvature)
 
 
 def image_by_slopes(mean: jax.Array, slopes: jax.Array, x: Gaussian, curvature: WeightedColumns | None = None) -> Image:
-    """Return f(x) = mean + slopes xi + c, x = m + L xi, with Cov c = `curvature`: none if f is affine."""
+    """Return the moments of f(x) = mean + slopes xi + c for x = m + L xi, as an `Image`.
+
+    Slopes are in xi itself, so that the image's unit of each xi_j is 1. Shapes: mean (p,), slopes (p, n).
+
+    Args:
+        mean: E f(x).
+        slopes: df/dxi; of an affine f(x) = F x + b they are F L.
+        x: the Gaussian of x, with the variances of xi.
+        curvature: columns of Cov c, the part of f that is uncorrelated with xi; None if f is affine.
+    """
     curvature = zero_covariance(len(mean)) if curvature is None else curvature
     return Image(mean, WeightedColumns(slopes, x.variances), np.ones(len(x.mean)), curvature)
 
@@ -157,12 +175,19 @@ def append_rows(x: Gaussian, mean: jax.Array, slopes: jax.Array, noise: Weighted
 
 
 def take_leading(x: Gaussian, n: int) -> Gaussian:
-    """Return the marginal Gaussian of the first n components: the first rows of L."""
+    """Return the Gaussian of the first n components alone, whose factors are the first n rows and columns of L.
+
+    The entries of L below the diagonal are stored row by row, so that those of the first rows come first.
+    """
     return Gaussian(x.mean[..., :n], x.lower[..., : n * (n - 1) // 2], x.variances[..., :n])
 
 
 def sum_unexplained(image: Image, noise: WeightedColumns) -> WeightedColumns:
-    """Return n columns of curvature + Cov w, the part of Cov(f(x) + w) uncorrelated with xi; `noise` factors Cov w."""
+    """Return n columns of Cov(c + w), where f(x) + w = mean + S xi + c + w has the linear part S xi in x = m + L xi.
+
+    It is the part of Cov(f(x) + w) that the slopes S do not explain. `image` has columns of Cov c (its curvature), and
+    `noise` the factors of Cov w. Of a function without curvature it is the noise alone.
+    """
     return from_summed_covariance(image.mean, image.curvature, noise).columns if len(image.curvature.weights) else noise
 
 
@@ -191,7 +216,7 @@ class Innovations(NamedTuple):
 
     @property
     def determined(self) -> jax.Array:
-        """Return which components those before them determine, to rounding (m,)."""
+        """Return which components (m,) those before them determine: their innovation has no variance but rounding."""
         return self.variance <= rounding(PIVOT_TOLERANCE, self.variance) * self.whole
 
     def log_density(self, present: jax.Array, size: jax.Array) -> jax.Array:
@@ -265,7 +290,15 @@ def correct_by_gain(
 ) -> Gaussian:
     """Correct x = m + L xi by any gain K of e = slopes xi + v: mean m + K e, error (L - K slopes) xi - K v.
 
-    e is the innovation. The covariance is a sum of squares (Joseph's form), and right for any gain K.
+    The covariance is (L - K slopes) diag(d) (L - K slopes)' + K Cov(v) K', a sum of squares (Joseph's form) that is
+    right for any gain K, also one that is not Kalman's.
+
+    Args:
+        x: the prior of n states, with Cov xi = diag(d).
+        slopes: of the measurement in xi (m, n).
+        noise: columns of Cov v.
+        gain: K (n, m).
+        innovation: e (m,).
     """
     error = WeightedColumns(x.root - gain @ slopes, x.variances)
     return from_columns(x.mean + gain @ innovation, join_columns(error, noise.through(gain)))
@@ -297,9 +330,10 @@ def impose_moments_of_combination(x: Gaussian, row: jax.Array, shift: jax.Array,
 def moments_of_mixture(
     means: Float[jax.Array, "parts n"], covariances: Float[jax.Array, "parts n n"], weights: Float[jax.Array, " parts"]
 ) -> tuple[jax.Array, jax.Array]:
-    """Return the mean m (n,) and covariance (n, n) of a mixture: sum_i w_i (P_i + (m_i - m)(m_i - m)').
+    """Return the mean m = sum_i w_i m_i (n,) and covariance sum_i w_i (P_i + (m_i - m)(m_i - m)') (n, n) of a mixture.
 
-    Differences are taken from the first mean, so that equal means, however large, have differences of exactly 0.
+    Means are counted from the first one, so that equal means, however large, have differences of exactly 0. The weights
+    w sum to 1.
     """
     about_first = means - means[0]
     shift = weights @ about_first
@@ -309,88 +343,8 @@ def moments_of_mixture(
 
 
 def merge_mixture(parts: Gaussian, weights: Float[jax.Array, " parts"]) -> Gaussian:
-    """Merge a mixture into one Gaussian of its moments; `parts` have a leading axis."""
+    """Return the one Gaussian that has the mean and covariance of a mixture of Gaussians.
+
+    `parts` are the Gaussians of the mixture, with a leading axis, and `weights` their probabilities, of sum 1.
+    """
     return from_covariance_by_elimination(*moments_of_mixture(parts.mean, parts.covariance, weights))
-
-
-class BackwardGain(NamedTuple):
-    """Regression of x on the next state x+ = m+ + L e: x = m + K e + a noise uncorrelated with e.
-
-    Rauch's smoother gain J = K L^-1 is never formed: an e_j of nearly no variance has a large column of K, which would
-    enter every entry of J and cancel again in J (x+ - m+).
-
-    `left` has the mean m and the noise's covariance Cov(x given x+). Shapes: gain K (n, n), ahead m+ = E x+ (n,), lower
-    (n (n - 1) / 2,) the entries of L below its diagonal.
-    """
-
-    left: Gaussian
-    gain: Float[jax.Array, "*time n n"]
-    ahead: Float[jax.Array, "*time n"]
-    lower: Float[jax.Array, "*time entries"]
-
-    def mean_given(self, later: jax.Array) -> jax.Array:
-        """Return E(x given x+ = `later`) = m + K L^-1 (x+ - m+), (n,)."""
-        return self.left.mean + self.gain @ self.apply_inverse_factor((later - self.ahead)[:, None])[:, 0]
-
-    def apply_inverse_factor(self, rows: jax.Array) -> jax.Array:
-        """Return L^-1 times rows (n, ...)."""
-        return decorrelate(unit_lower(self.lower), rows)
-
-
-def condition_on_next_state(x: Gaussian, slopes: jax.Array, ahead: jax.Array, noise: WeightedColumns) -> BackwardGain:
-    """Return the regression of a state x on the next one, x+, by measuring x+ part by part.
-
-    A smoother needs x = m + K e + a noise, e the innovations of x+. x = m + L_x xi and x+ = ahead + slopes xi + N omega
-    have together the factors [[L_x, 0], [slopes, N]]; xi and omega are uncorrelated, of variances d and r. Each part
-    (component) of x+ is measured, with no noise but omega. Its innovation given the parts before it is e_i, its gain
-    column i of K (rows of x) and of L (rows of the later parts of x+): x+ = ahead + L e.
-
-    Args:
-        x: the state's Gaussian, with L_x (n, n) and d (n,).
-        slopes: of x+ in xi, (n, n).
-        ahead: the mean of x+, (n,).
-        noise: N (n, n), unit lower triangular, as `triangularise` makes it, and r (n,).
-
-    Returns:
-        The law of x given x+ (its mean m), K (n, n), the mean of x+, and the entries of L below its diagonal.
-    """
-    n, root = len(x.mean), jnp.concatenate([x.root, slopes])
-    # Var x+_i = sum_j slopes_ij^2 d_j + sum_j N_ij^2 r_j, and the variance up to which slopes of x+ are rounding.
-    variances_of_next = slopes**2 @ x.variances + noise.matrix**2 @ noise.weights
-    rounding_of_next = rounding_of_products(n, variances_of_next)
-    omega_rows, weights = jnp.concatenate([jnp.zeros((n, n), slopes.dtype), noise.matrix]), jnp.asarray(noise.weights)
-
-    def measure_part(
-        i: int | jax.Array, root: jax.Array, d: jax.Array, rounding: jax.Array
-    ) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Measure part i of x+: return the rows and variances after it, and its gain."""
-        # N is unit lower triangular, so part i is the first that omega_i is in, and the parts before it have determined
-        # omega_0 ... omega_i-1. So it takes one more column than xi has: that of omega_i, with the slope 1 in part i.
-        f, column, r = root[n + i], omega_rows[:, i], weights[i]  # Var(part i) = f diag(d) f' + r
-        product = d * f
-        power = f * product
-        # Where the parts before it determine a part, its slopes in xi are their rounding, and count as zero.
-        is_rounding = spoils_what_is_known(jnp.sum(power), rounding, r)
-        products = jnp.append(where(is_rounding, 0.0, product), r)
-        powers = jnp.append(where(is_rounding, 0.0, power), r)
-        rows = jnp.concatenate([root, column[:, None]], axis=1)
-        rows, d, gain, _ = update_by_scalar_given_products(
-            rows, jnp.append(d, r), jnp.append(f, 1.0), (products, powers), jnp.zeros_like(r)
-        )
-        return rows[:, :n], d[:n], gain
-
-    root, d, gains = update_by_parts(measure_part, root, x.variances, rounding_of_next)
-    left = Gaussian(x.mean, below_diagonal(root[:n]), d)
-    return BackwardGain(left, gains[:n], ahead, below_diagonal(gains[n:]))
-
-
-def rts_step(back: BackwardGain, later: Gaussian) -> Gaussian:
-    """Smooth x by the smoothed next state: m + J (m_s+ - m+), J P_s+ J' + Cov(x given x+), J = K L^-1.
-
-    `later` is the smoothed law of x+, of mean m_s+ and covariance P_s+. `back` is the regression x = m + K e + noise on
-    x+ = m+ + L e; `back.left` has the noise's covariance, Cov(x given x+).
-
-    Source: Rauch, Tung and Striebel, Maximum likelihood estimates of linear dynamic systems (1965).
-    """
-    of_next_state = WeightedColumns(back.gain @ back.apply_inverse_factor(later.root), later.variances)
-    return from_columns(back.mean_given(later.mean), join_columns(of_next_state, back.left.columns))

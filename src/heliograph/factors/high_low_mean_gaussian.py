@@ -26,7 +26,7 @@ class SplitMeanGaussian(NamedTuple):
 
     @property
     def about_center(self) -> Gaussian:
-        """Law of x - high: its mean is `low`, its covariance that of x."""
+        """The Gaussian of x - high, the small part of x: its mean is `low`, its covariance that of x."""
         return Gaussian(self.low, self.lower, self.variances)
 
 

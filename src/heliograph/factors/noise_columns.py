@@ -49,9 +49,9 @@ def measure_uncorrelated(
     # N^-1 slopes and N^-1 (z - E z); a missing component gets variance 1, with slopes of 0.
     rows, variance = decorrelate(noise.matrix, rows), jnp.where(present, noise.weights, 1.0)
     # Each scalar update changes the rows of L and the slopes of components to come in the same way, so these are
-    # stacked. So are the mean and, negated, the innovations.
-    root, news = jnp.concatenate([root, rows[:, :n]]), jnp.concatenate([mean, -rows[:, n]])
-    return update_by_rows(root, d, news, variance, least)
+    # stacked. So are the mean and what remains of z - E z, times -1.
+    root, mean_and_rest = jnp.concatenate([root, rows[:, :n]]), jnp.concatenate([mean, -rows[:, n]])
+    return update_by_rows(root, d, mean_and_rest, variance, least)
 
 
 def measure_beside_noises(
@@ -87,7 +87,7 @@ def measure_beside_noises(
     of_state = jnp.concatenate([root, jnp.zeros((n, m), N.dtype)], axis=1)
     root = jnp.concatenate([of_state, jnp.concatenate([rows[:, :n], N], axis=1)])
     # The mean and -(z - E z) below it change alike: both gain (their row's gain) times the innovation.
-    news, d = jnp.concatenate([mean, -rows[:, n]]), jnp.concatenate([d, r])
+    mean_and_rest, d = jnp.concatenate([mean, -rows[:, n]]), jnp.concatenate([d, r])
     innovations, variances = list[jax.Array](), list[jax.Array]()
     for i in range(m):
         f = root[n + i]  # slopes of component i on (xi, omega), given the components before it
@@ -97,8 +97,8 @@ def measure_beside_noises(
         other_noise = jnp.where(is_rounding, noise_beside_rounding(n, least[i]), jnp.where(present[i], 0.0, 1.0))
         root, d, gain, total = update_by_scalar(root, d, f, other_noise)
         total = jnp.where(is_rounding, r[i], total)
-        innovations.append(-news[n + i])
+        innovations.append(-mean_and_rest[n + i])
         variances.append(total)
-        news = news + gain * innovations[i]
+        mean_and_rest = mean_and_rest + gain * innovations[i]
         least = propagate_slope_rounding(least, gain[n:], least[i] if i else rounding_of_products(n, total))
-    return root[:, :n], d[:n], news, stack_numbers(innovations), stack_numbers(variances)
+    return root[:, :n], d[:n], mean_and_rest, stack_numbers(innovations), stack_numbers(variances)

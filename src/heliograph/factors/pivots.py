@@ -32,7 +32,7 @@ def reciprocal_or_one(x: jax.Array) -> jax.Array:
 
 @jax.jit
 def reciprocal_or_zero(x: jax.Array) -> jax.Array:
-    """Return 1 / x of a positive number, and 0 of 0."""
+    """Return 1 / x of a positive number, and 0 of 0: of a variance that is 0, such a gain is 0."""
     positive, one = is_positive(x), lax.full_like(x, 1.0)
     return lax.select(positive, lax.div(one, lax.select(positive, x, one)), lax.full_like(x, 0.0))
 
@@ -64,7 +64,11 @@ def _differentiate_share(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Ar
 
 
 def replace_value(value: jax.Array, expression: jax.Array) -> jax.Array:
-    """Return a value with the derivatives of an expression that is another way to compute it, or all but it."""
+    """Return `value`, but with the derivatives of `value` plus those of `expression`.
+
+    The term that is added, the expression less itself as a constant, is 0 but has its derivatives. If the value is
+    constant, the result has those of the expression alone.
+    """
     return value + (expression - lax.stop_gradient(expression))
 
 
@@ -74,7 +78,7 @@ def rounding_of_pivots(covariance: Array) -> float:
 
 
 def unit_of(numbers: Array) -> float:
-    """Return eps of the precision in which these numbers are computed."""
+    """Return eps, the relative rounding error, of the precision in which these numbers are computed."""
     return max(float(np.finfo(np.dtype(numbers.dtype)).eps), float(np.finfo(precision_in_use()).eps))
 
 
@@ -105,7 +109,10 @@ def take_pivot(
 
 
 def set_to_zero(numbers: jax.Array, is_rounding: jax.Array) -> jax.Array:
-    """Return numbers, zero where they are rounding, but with their derivatives where the program is differentiated."""
+    """Return the numbers, with 0 in place of those that are only rounding.
+
+    Where the program is differentiated, these zeros keep the first derivatives of the numbers.
+    """
     if not writes_for_derivatives():
         return jnp.where(is_rounding, 0.0, numbers)
     once = differentiable_once(numbers, is_rounding)
@@ -113,10 +120,11 @@ def set_to_zero(numbers: jax.Array, is_rounding: jax.Array) -> jax.Array:
 
 
 def spoils_what_is_known(power: jax.Array, least: jax.Array, noise: jax.Array) -> jax.Array:
-    """Return whether slopes of a variance `power` are rounding, up to `least`, and would change what is known by it.
+    """Return whether a measurement's slopes are only rounding, so that measuring by them would spoil the state.
 
-    Beside a noise of more than `least` / eps they change no digit of a value. Where the program is differentiated they
-    count then, as their derivatives do.
+    They are rounding if their variance `power` = f' diag(d) f is at most `least`. In a program that is differentiated
+    they are kept all the same beside a noise variance of `least` / eps or more: they change no digit of a value then,
+    and their derivatives count.
     """
     is_rounding = power <= least
     return is_rounding & (least > unit_of(least) * noise) if writes_for_derivatives() else is_rounding
@@ -124,26 +132,37 @@ def spoils_what_is_known(power: jax.Array, least: jax.Array, noise: jax.Array) -
 
 @jax.custom_jvp
 def spoil_derivatives(numbers: jax.Array, spoilt: jax.Array) -> jax.Array:
-    """Return numbers whose derivatives are NaN where these cannot be had: `spoilt` has their shape, or fits to it."""
+    """Return the numbers unchanged, with derivatives that are NaN where `spoilt` says so.
+
+    For places where rounding leaves no digit of a derivative: NaN is seen, a wrong number is not. `spoilt` has the
+    shape of the numbers, or one that broadcasts to it.
+    """
     return numbers
 
 
 @spoil_derivatives.defjvp
 def _differentiate_spoilt(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
-    """Return the numbers, and their derivatives times NaN where they are spoilt."""
+    """Return the numbers, and their derivatives along a tangent: NaN where `spoilt`, and as they are elsewhere."""
     (numbers, spoilt), (slopes, _) = primals, tangents
     return numbers, slopes * jnp.where(spoilt, jnp.nan, 1.0)
 
 
 @jax.custom_jvp
 def differentiable_once(numbers: jax.Array, where: jax.Array) -> jax.Array:
-    """Return numbers whose second derivatives at `where`, which cannot be had, are infinite or NaN along themselves."""
+    """Return the numbers unchanged, such that their second derivatives at `where` become infinite or NaN.
+
+    Used where a first derivative is right, but rounding has taken all digits of the second.
+    """
     return numbers
 
 
 @differentiable_once.defjvp
 def _differentiate_once(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
-    """Return the numbers, and their derivatives times a 1 whose own derivative overflows at `where`."""
+    """Return the numbers, and their derivatives times the factor 1 + (x - c) largest^2, c the constant value of x.
+
+    The factor is 1. Its own derivative, largest^2, is 0 except at `where`, where it overflows: so second derivatives
+    are infinite or NaN there instead of wrong numbers.
+    """
     (numbers, where), (slopes, _) = primals, tangents
     largest = jnp.where(where, float(np.finfo(np.dtype(numbers.dtype)).max), jnp.zeros_like(numbers))
     none = numbers - lax.stop_gradient(numbers)

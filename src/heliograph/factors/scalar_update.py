@@ -12,6 +12,9 @@ from heliograph.factors.repeated_measurements import noise_beside_rounding, roun
 from heliograph.numerics.linalg import WRITTEN, where
 from heliograph.numerics.trace_settings import writes_for_derivatives, writes_short_programs
 
+# From the part's number, the rows, the variances and its rounding variance, to rows, variances and gain given the part.
+MeasurePart = Callable[[int | jax.Array, jax.Array, jax.Array, jax.Array], tuple[jax.Array, jax.Array, jax.Array]]
+
 
 def update_by_scalar(
     root: jax.Array, d: jax.Array, f: jax.Array, noise: jax.Array
@@ -83,7 +86,7 @@ def update_root_columns(
 
 
 def update_by_parts(
-    measure_part: Callable[..., tuple[jax.Array, jax.Array, jax.Array]],
+    measure_part: MeasurePart,
     root: jax.Array,
     d: jax.Array,
     rounding_variance: jax.Array,
@@ -156,8 +159,8 @@ def update_by_row(
     return root, d, gain, where(is_rounding, noise, variance)
 
 
-Carried = tuple[jax.Array, jax.Array, jax.Array, jax.Array]
-Measured = tuple[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array]
+Carried = tuple[jax.Array, jax.Array, jax.Array, jax.Array]  # rows, variances d, means, rounding variances
+Measured = tuple[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array]  # rows, d, means, innovations, their variances
 
 
 def update_by_rows(
@@ -244,10 +247,10 @@ def _update_by_rows_in_loop(
 
 
 def _move_row_to_end(rows: jax.Array, i: int) -> jax.Array:
-    """Return rows with row i behind all others."""
+    """Return the rows in a new order: row i is the last, all others stay in their order."""
     return jnp.concatenate([rows[:i], rows[i + 1 :], rows[i : i + 1]])
 
 
 def stack_numbers(entries: list[jax.Array]) -> jax.Array:
-    """Return numbers as a vector, of none an empty one."""
+    """Return a list of numbers () as a vector; `jnp.stack` refuses an empty list, of which it is an empty one."""
     return jnp.stack(entries) if entries else jnp.zeros(0)

@@ -21,22 +21,23 @@ class ObservedRoot(NamedTuple):
 
 
 def covariance_of_root(root: Float[np.ndarray, "*items n c"]) -> Float[np.ndarray, "*items n n"]:
-    """Return W W', symmetric to the last digit."""
+    """Return the covariance W W' (n, n) of a root W (n, columns), symmetric to the last digit."""
     product = root @ root.swapaxes(-1, -2)
     return np.asarray(product + product.swapaxes(-1, -2)) / 2
 
 
 def roots_of(covariance: Float[np.ndarray, "*items n n"]) -> Float[np.ndarray, "*items n n"]:
-    """Return W with W W' = P of many covariances, by the eigenvectors of their correlation matrices.
+    """Return square roots W with W W' = P of many covariances P, by the eigenvectors of their correlation matrices.
 
     Correlations do not depend on units. An eigenvalue that rounding made negative counts as zero. A component of
-    variance zero has a row of zeros in W; `is_known` is False in its row and column of P.
+    variance zero has a row of zeros in W.
     """
     deviation = np.sqrt(np.maximum(np.diagonal(covariance, axis1=-2, axis2=-1), 0.0))
     unit = np.where(deviation > 0, deviation, 1.0)
     scale = unit[..., :, None] * unit[..., None, :]
-    is_known = deviation[..., :, None] * deviation[..., None, :] > 0
-    values, vectors = np.linalg.eigh(np.where(is_known, covariance, 0.0) / scale)
+    # Entries of P between two components that have a variance; all others are 0.
+    varies = deviation[..., :, None] * deviation[..., None, :] > 0
+    values, vectors = np.linalg.eigh(np.where(varies, covariance, 0.0) / scale)
     root_values = np.sqrt(np.maximum(values, 0.0))
     return np.asarray(unit[..., :, None] * vectors * root_values[..., None, :])
 

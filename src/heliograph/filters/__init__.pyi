@@ -39,7 +39,7 @@ from .plausibility import (
 from .filter_for_likelihood import (
     likelihood_filter as likelihood_filter,
 )
-from .linear.linear import (
+from .linear.memory_ignored import (
     as_current_filter as as_current_filter,
     memoryless_filter as memoryless_filter,
 )

@@ -10,8 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.factors.covariance_factors import WeightedColumns, decorrelate, join_columns, triangularise, unit_lower
-from heliograph.factors.factored_gaussian import BackwardGain, Gaussian, condition_on_next_state, from_columns, rts_step
+from heliograph.factors.factored_gaussian import Gaussian, from_columns
 from heliograph.factors.gaussian_on_group import settle, unsettle
+from heliograph.factors.state_given_next import BackwardGain, condition_on_next_state, rts_step
 from heliograph.filters.plausibility import innovation_distance
 from heliograph.model.estimate import Claim, Estimate, Innovation, weakest
 from heliograph.numerics.angles.angle import Angles, wrap_angles

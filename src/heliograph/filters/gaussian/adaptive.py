@@ -40,7 +40,7 @@ from heliograph.numerics.gaussian_density import log_density
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.moments.second_moments import SecondOrder
 
-ITERATIONS = 5
+ITERATIONS = 5  # of an update: the state for given noise variances, then these for the given state
 PRIOR_SHAPE = 3.0  # of the inverse gamma law of each variance: the weight of six noises of the model's variance
 
 
@@ -82,7 +82,7 @@ class AdaptiveFilter(AbstractWrapper):
     memory: Float[jax.Array | np.ndarray, ""]
 
     def within(self, state: AdaptiveBelief) -> Gaussian:
-        """Return the Gaussian of the plant's state, without the laws of the noise variances."""
+        """Return the part of the state that the base filter has: the Gaussian of x, without the noise variances."""
         return state.gaussian
 
     @compile_on_call
@@ -97,7 +97,7 @@ class AdaptiveFilter(AbstractWrapper):
 
     @predicts
     def predict(self, state: AdaptiveBelief, u: ArrayLike = (), k: Step = 0) -> AdaptiveBelief:
-        """Predict the plant's state as the base filter does; the laws of the noise variances stay until data arrive."""
+        """Predict the plant's state as the base filter does; the laws of the noise variances stay until data come."""
         return AdaptiveBelief(self.base.predict(state.gaussian, u, k), state.shape, state.scale)
 
     @corrects
@@ -138,8 +138,8 @@ class AdaptiveFilter(AbstractWrapper):
 
     def variances(self, state: AdaptiveBelief) -> Float[np.ndarray, "... m"]:
         """Return the noise variances of the received components, b / a, of one state or of several stacked ones."""
-        variances: np.ndarray = np.asarray(state.scale) / np.asarray(state.shape)
-        return variances
+        R: np.ndarray = np.asarray(state.scale) / np.asarray(state.shape)  # b / a
+        return R
 
     def noise_deviations(self, state: AdaptiveBelief, k: Step = 0) -> Float[jax.Array, " outputs"]:
         """Return standard deviations of each output's noise as they were learned, in units of those of the model.
@@ -148,9 +148,10 @@ class AdaptiveFilter(AbstractWrapper):
         the root mean square over the received numbers that carry it, or 1 if none does.
         """
         noise = at(self.noise, k)
-        ratio = state.scale / state.shape / jnp.diagonal(jnp.asarray(noise.covariance))
+        learned_variance, variance_of_model = state.scale / state.shape, jnp.diagonal(jnp.asarray(noise.covariance))
+        ratio = learned_variance / variance_of_model
         carries = jnp.asarray(noise.output)  # (m, p): 1 where received number i carries output a
-        count = jnp.sum(carries, axis=0)
+        count = jnp.sum(carries, axis=0)  # how many received numbers carry each output
         return jnp.sqrt(jnp.where(count > 0, carries.T @ ratio / jnp.maximum(count, 1), 1.0))
 
 
@@ -278,14 +279,23 @@ def _variational_update(
 
 
 def _make_independent_noise(variance: jax.Array) -> WeightedColumns:
-    """Return the noise of independent components with these variances (m,)."""
+    """Return columns of the covariance diag(variance) (m, m) of noises that are independent of each other."""
     return WeightedColumns(np.eye(len(variance)), variance)
 
 
 def _scale_branches(law: NoiseBranches, ratio: jax.Array) -> NoiseBranches:
-    """Return the noise's Gaussian branches scaled to variances `ratio` (m,) times as large."""
-    ratio = ratio[:, None]
-    return NoiseBranches(law.log_share, law.mean * jnp.sqrt(ratio), law.variance * ratio, law.least * ratio)
+    """Return the law of sqrt(ratio_i) v_i for a noise v_i that is a mixture of Gaussians (its branches).
+
+    Each branch's mean is multiplied by sqrt(ratio), its variance and least variance by `ratio` (m,); probabilities
+    stay. The arrays of the law are (m, branches).
+    """
+    ratio_of_row = ratio[:, None]
+    return NoiseBranches(
+        log_share=law.log_share,
+        mean=law.mean * jnp.sqrt(ratio_of_row),
+        variance=law.variance * ratio_of_row,
+        least=law.least * ratio_of_row,
+    )
 
 
 def adaptive_filter(filter: AbstractFilter, memory: ArrayLike = 0.98) -> AdaptiveFilter:
@@ -323,9 +333,10 @@ def _find_sensor_noise(filter: GaussianFilter) -> ReceivedNoise | OverTime:
     """Return the sensor's noise behind the filter's channel, over time if sensor or channel varies."""
 
     def describe(sensor: AbstractSensor, channel: SecondOrder) -> ReceivedNoise:
-        """Return the sensor's noise in the received numbers at one step, by its `channel`'s second moments.
+        """Return the law of the sensor's noise v as it arrives in z = G v + ..., by the second moments of the gain G.
 
-        The last hop's noise is in the channel's moments already, so none is given apart.
+        Only v is learned: noises of the channel stay in the channel's moments, so `late` (the last hop's) is None. Each
+        variance is learned by itself, so noises whose components are correlated are refused (`independent`).
         """
         return describe_outlier_noise(sensed=sensor.noise, late=None, plain=channel, independent=True)
 

@@ -48,16 +48,17 @@ class DiffuseFilter(AbstractSizedFilter):
     @compile_on_call
     def init(self) -> Diffuse:
         """Return the Gaussian before any data, with infinite variance in the state's unknown directions."""
-        start = first(self.plant)
-        covariance = start.initial_covariance
-        finite, infinite_directions = columns_of(covariance.known), np.array(covariance.unknown)
-        return start_diffuse(jnp.asarray(start.initial_mean), finite, infinite_directions)
+        plant = first(self.plant)  # as it is at the first step
+        start = plant.initial_covariance  # covariance `known` (n, n) of known components, and flags `unknown` (n,)
+        finite, is_unknown = columns_of(start.known), np.array(start.unknown)
+        return start_diffuse(jnp.asarray(plant.initial_mean), finite, is_unknown)
 
     @predicts
     def predict(self, state: Diffuse, u: ArrayLike = (), k: Step = 0) -> Diffuse:
         """Predict x over x+ = A x + B u + w.
 
-        Unknown directions of x have infinite variance. E[x_i^2] at the start gives the rounding of the others.
+        Unknown directions of x keep an infinite variance. To Cov w the rounding of the numbers is added, as large as
+        E[x_i^2] at the start says: so no covariance becomes singular by rounding.
         """
         plant, u = at(self.plant, k), jnp.asarray(u)
         noise = factor_process_noise(plant, u, second_moments_at_start(self.plant))
@@ -65,7 +66,11 @@ class DiffuseFilter(AbstractSizedFilter):
 
     @corrects
     def correct(self, state: Diffuse, z: ArrayLike, k: Step = 0) -> tuple[Diffuse, Innovation]:
-        """Condition on z; a number that depends on a direction of x that is still unknown has the innovation NaN."""
+        """Condition on z = H x + v, and return the innovation z - H m - E v with its covariance H P H' + R.
+
+        A component of z that depends on a still unknown direction of x has an infinite variance: it teaches that
+        direction, and its innovation is NaN, as no prediction of it existed.
+        """
         sensor, z = at(self.sensor, k), jnp.asarray(z)
         matrix, noise = jnp.asarray(sensor.matrix), sensor.noise.columns
         value = z - matrix @ state.mean - jnp.asarray(sensor.noise.mean)
@@ -79,11 +84,15 @@ class DiffuseFilter(AbstractSizedFilter):
 
     @estimates
     def estimate(self, state: Diffuse) -> Estimate:
-        """Return mean and covariance; of what is unknown the variance is infinite, with 0 beside it."""
+        """Return the mean and covariance; an unknown component has infinite variance, and 0 in the rest of its row."""
         return Estimate(state.mean, state.covariance, self.claim)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
-        """Return the Rauch-Tung-Striebel step, with factors of the covariance's finite and infinite parts."""
+        """Return what a Rauch-Tung-Striebel pass needs of this step: x after the update, and x before it given x+.
+
+        The step leads from `step.before` over x+ = A x + B u + w to `step.prior`, and by z to `step.after`. A direction
+        that stays unknown given all of x+ has the variance NaN.
+        """
         plant, u = at(self.plant, step.k), jnp.asarray(step.u)
         noise = triangularise(factor_process_noise(plant, u, second_moments_at_start(self.plant)))
         predicted = jnp.asarray(step.prior.mean)
@@ -92,19 +101,27 @@ class DiffuseFilter(AbstractSizedFilter):
 
 
 def has_unknown_start(plant: AnyPlant) -> bool:
-    """Return whether nothing is known of some state's start."""
+    """Return whether the plant's initial covariance says that nothing is known of some state (`hg.diffuse`)."""
     return isinstance(getattr(first(plant), "initial_covariance", None), UnknownStart)
 
 
 def diffuse_filter(plant: AnyPlant, sensor: AnySensor) -> DiffuseFilter:
-    """Return the filter of a plant with an unknown start; raise ValueError for a plant that varies or is not linear."""
+    """Return the Kalman filter of a linear plant of whose first state some components are unknown.
+
+    Args:
+        plant: a linear plant that does not vary over time, with `hg.diffuse` as its initial covariance.
+        sensor: a linear sensor without inputs, received directly; it may vary over time.
+
+    Raises:
+        ValueError: a plant or sensor that is not linear, a plant that varies, a sensor with inputs.
+    """
     check_linear("Kalman filter from an unknown start", plant, sensor)
     if isinstance(plant, OverTime):
         raise fail("plant with an unknown start", "one that does not vary over time", "one in over_time")
     check_sensor(first(sensor), len(plant.states))
     first(sensor).refuse_inputs("a filter from an unknown start")
     outputs = len(first(sensor).outputs)
-    filter = DiffuseFilter(
-        plant=plant, sensor=sensor, **make_sizes(lower_claim_by_noise("exact", plant, sensor), plant, outputs)
-    )
+    # "upper" instead of "exact" if a noise is only known by a bound of its covariance.
+    claim = lower_claim_by_noise("exact", plant, sensor)
+    filter = DiffuseFilter(plant=plant, sensor=sensor, **make_sizes(claim, plant, outputs))
     return with_assumed(filter, AssumedModel(plant, sensor, perfect(outputs)))

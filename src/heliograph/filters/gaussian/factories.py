@@ -48,13 +48,13 @@ def _make_gaussian_filter(
     instance("update", update, AbstractUpdate, "one such as Polytope()")
     channel = make_perfect_channel(sensor) if channel is None else channel
     check_link(first(sensor), first(channel), len(start.states))
-    angles = find_received_angles(plant, sensor, channel)
+    angles = find_received_angles(plant, sensor, channel)  # indices of the components of z that are angles
     mean, covariance, prior_given = choose_initial_moments(start, initial_mean, initial_covariance)
     assumed = AssumedModel(plant, sensor, channel)  # what the claim rests on: the channel with its memory
     # Moments of the channel without its memory: where that matters, the described channel is not the true one.
     trusted = trusted and not memory_matters(channel)
     channel = without_memory(channel)
-    described = describe_channel_moments(channel, update)
+    described = describe_channel_moments(channel, update)  # M = E G, Cov G, Cov n and their bounds
     pairs = zip(unstack(channel), unstack(described), strict=True)
     # The Kalman filter is exact: linear, no random gain, no angle (and so no attitude: that has no linear plant).
     without_angles = not start.circular and not first(sensor).circular
@@ -215,7 +215,10 @@ def mean_gain_filter(
 def make_base_gaussian_filter(
     name: str, plant: AnyPlant, sensor: AnySensor, channel: Channel, transform: AbstractTransform, rule: AbstractUpdate
 ) -> GaussianFilter:
-    """Return the Gaussian filter inside another filter; raise ValueError if the receiver is told the link's state.
+    """Return the Gaussian filter that another filter holds inside, of a plant, a sensor and a channel.
+
+    Behind a link that reports its state (a gain, say) with each message, `gaussian_filter` makes another kind of
+    filter, which those others cannot hold.
 
     Args:
         name: of the other filter, for the message.
@@ -224,6 +227,9 @@ def make_base_gaussian_filter(
         channel: from the sensor to the filter.
         transform: moments of a nonlinear function.
         rule: how an uncertain channel is bounded.
+
+    Raises:
+        ValueError: a channel that reports its state to the receiver; what `gaussian_filter` refuses.
     """
     filter = gaussian_filter(plant, sensor, channel, transform, rule)
     return instance(f"channel of a {name}", filter, GaussianFilter, "one of which nothing is told")

@@ -62,11 +62,15 @@ class GaussianFilter(AbstractGaussianStateFilter):
         return indices
 
     def angles_used(self) -> FilterAngles:
-        """Return the angles of its plant, and those that its channel delivers."""
+        """Return the indices of states that are angles, and of components of z that are."""
         return FilterAngles(first(self.plant).angles, self.observed_angles)
 
     def predict_signal(self, state: Gaussian, k: Step) -> Signal:
-        """Return the moments of the sensor's signal y at step k, from the state before its measurement."""
+        """Return the moments of the sensor's signal y = h(x) + v at step k, from the predicted Gaussian of x.
+
+        They are E y, the slopes of y in the factors of x, and Cov v with the curvature of h. `self.transform` finds
+        them where h is not linear.
+        """
         plant, sensor = at(self.plant, k), at(self.sensor, k)
         return find_signal_moments(plant, sensor, self.transform, state, second_moments_at_start(self.plant, self))
 
@@ -74,11 +78,11 @@ class GaussianFilter(AbstractGaussianStateFilter):
     def expect_signals(
         self, z: Float[Array, "*runs steps m"], u: Float[Array, "steps inputs"]
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Return mean (steps, p) and covariance (steps, p, p) of the signal before each row, and z.
+        """Return the predicted mean (steps, p) and covariance (steps, p, p) of the sensor's signal y, and z.
 
-        The signal y is what the sensor measures, before the channel; p is its length. `z` is returned with full turns
-        added to its angles, so that they are within half a turn of their expected values and differences make sense.
-        With several runs all results have a leading axis of runs.
+        y = h(x) + v is what the sensor sends, p numbers; the channel makes z = G y + n of it. Each row's moments are
+        those given all rows before it. Angles in the returned z have full turns added, so that they are within half a
+        turn of their expected values. With several runs all results have a leading axis of runs.
 
         Args:
             z: measurements of a run (steps, m), or of several (runs, steps, m).
@@ -86,33 +90,34 @@ class GaussianFilter(AbstractGaussianStateFilter):
         """
 
         def step(state: Gaussian, row: tuple[jax.Array, ...]) -> tuple[Gaussian, tuple[jax.Array, ...]]:
-            """Filter one row (k, z, u); return the state, and the triple (mean, covariance, z).
+            """Filter one row (k, z, u); return the state after it, and the triple (E y, Cov y, z) of its signal y.
 
-            Mean and covariance are those of the row's signal before z. Angles in the returned z are within half a turn
-            of their expected values.
+            Angles in the returned z are within half a turn of their expected values.
             """
             k, z_k, u_k = row
             prior = self.predict(state, u_k, k)
             channel, y = at(self.channel, k), self.predict_signal(prior, k)
-            # E z = mean_gain E y + offset of the channel z = G y + n.
-            near = wrap_near(z_k, channel.mean_gain @ y.mean + channel.offset, self.observed_angles)
-            return self.correct(prior, z_k, k)[0], (y.mean, y.covariance, near)
+            expected_z = channel.mean_gain @ y.mean + channel.offset  # E z = E[G] E y + E n
+            z_near_expected = wrap_near(z_k, expected_z, self.observed_angles)
+            after, _ = self.correct(prior, z_k, k)
+            return after, (y.mean, y.covariance, z_near_expected)
 
         def expect(z: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-            """Return for all rows the mean and covariance of the signal before z, and z with angles near their mean.
-
-            `step` filters one row. u holds the inputs of all rows.
-            """
-            start, rows = jax.tree.map(jnp.asarray, self.init()), (jnp.arange(len(z)), z, jnp.asarray(u))
-            mean, covariance, near = jax.lax.scan(step, start, rows)[1]
-            return mean, covariance, near
+            """Filter all rows of one run z (steps, m), and return what `step` returns of each, stacked."""
+            start = jax.tree.map(jnp.asarray, self.init())
+            rows = jnp.arange(len(z)), z, jnp.asarray(u)
+            _, (mean, covariance, z_near_expected) = jax.lax.scan(step, start, rows)
+            return mean, covariance, z_near_expected
 
         several_runs = jnp.ndim(z) == 3
         return (jax.vmap(expect) if several_runs else expect)(jnp.asarray(z))
 
     @corrects
     def correct(self, state: Gaussian, z: ArrayLike, k: Step = 0) -> tuple[Gaussian, Innovation]:
-        """Correct with the measurement z, with moments of the signal y = h(x) + v about the prediction."""
+        """Condition the predicted Gaussian of x on z = G y + n, where y = h(x) + v is the sensor's signal.
+
+        Moments of y come from the transform. `self.rule` bounds the error covariance if the law of G is uncertain.
+        """
         channel, signal = at(self.channel, k), self.predict_signal(state, k)
         # Gain and covariance: behind a known gain they do not depend on E y, which is data. So it is set to 0 there.
         moments_for_gain = signal.about_mean() if self.linear else signal
@@ -134,12 +139,16 @@ class GaussianFilter(AbstractGaussianStateFilter):
 
     @property
     def has_known_gain(self) -> bool:
-        """True if no gain of the channel is random, so that no covariance needs E[x x'] (before any data)."""
-        return self.linear  # which says it, and more: plant and sensor are linear too
+        """True if all gains of the channel are known.
+
+        A random gain multiplies the whole signal, so that covariances would need E[x x'] before any data. `linear` says
+        that no gain is random, and that plant and sensor are linear, too: only such filters are asked.
+        """
+        return self.linear
 
     @property
     def law_at_start(self) -> HasInitialMoments:
-        """Where the law of the first state stands: here, since the filter may start from another one than its plant."""
+        """What holds the law of the first state: this filter, which may start from another law than its plant's."""
         return self
 
     def trace_log_likelihood(
@@ -155,6 +164,7 @@ class GaussianFilter(AbstractGaussianStateFilter):
         A linear filter (Kalman's) computes the same value with a derivative that goes by covariances instead of their
         factors, which is faster.
         """
+        # The faster derivative is that of Kalman's filter alone: no bounds over laws, no rounding by a quantizer.
         if not self.linear or stack_over_time(self.channel).uncertain or find_rounded_noises(self.sensor):
             return super().trace_log_likelihood(plain, z, u)
         from heliograph.filters.linear.traced_likelihood import trace_log_likelihood  # imported only where it is used
@@ -169,7 +179,10 @@ class GaussianFilter(AbstractGaussianStateFilter):
         return make_moving_origin_filter(self)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
-        """Precompute all covariances and gains, where they do not depend on data."""
+        """Return the filter with all covariances and gains computed in advance, for these inputs and complete data.
+
+        Only a linear filter can: elsewhere they depend on data, and the filter is returned as it is.
+        """
         return plan_filter(self, inputs) if self.linear else self
 
 
@@ -208,7 +221,10 @@ def correct_signal(
 
 
 def describe_channel_moments(channel: Channel, update: AbstractUpdate) -> SecondOrder | OverTime:
-    """Describe the channel's second moments in the form of the update, for each step where it varies."""
+    """Return the moments of z = G y + n (E G, Cov G, Cov n, and bounds over uncertain laws) that the update works by.
+
+    For a channel that varies over time they are those of each step.
+    """
     described: SecondOrder | OverTime = at_each_step(update.describe, channel)
     return described
 

@@ -58,33 +58,31 @@ class AbstractGaussianStateFilter(AbstractSizedFilter):
     initial_covariance: Array
 
     def angles_used(self) -> FilterAngles:
-        """Return the angles of its plant, and those that its channel delivers."""
+        """Return the indices of states that are angles; z is taken to have none here."""
         return FilterAngles(first(self.plant).angles, ())
 
     @in_float64
     def init(self) -> Gaussian:
-        """Return the belief before any data."""
+        """Return the Gaussian of x before any data: mean, and factors L diag(d) L' of the covariance."""
         return from_covariance(self.initial_mean, self.initial_covariance)
 
     @predicts
     def predict(self, state: Gaussian, u: ArrayLike = (), k: Step = 0) -> Gaussian:
-        """Return the mean and covariance of f(x, u) + w.
+        """Return the Gaussian of f(x, u) + w, with the moments of f by the filter's transform.
 
-        The filter's transform computes the moments of f. E[x_i^2] at the start gives the size of the numbers that are
-        rounded.
+        E[x_i^2] at the start gives the size of the numbers that are rounded: their rounding is added to Cov w.
         """
-        return predict_gaussian(
-            at(self.plant, k), self.transform, state, jnp.asarray(u), second_moments_at_start(self.plant, self)
-        )
+        initial_power = second_moments_at_start(self.plant, self)
+        return predict_gaussian(at(self.plant, k), self.transform, state, jnp.asarray(u), initial_power)
 
     @estimates
     def estimate(self, state: Gaussian) -> Estimate:
-        """Return the mean and covariance of the belief, angles between -pi and pi."""
+        """Return the mean and covariance of x given the data, with angles between -pi and pi."""
         mean = wrap_angles(state.mean, first(self.plant).angles)
         return Estimate(mean, state.covariance, self.claim, attitude=self.attitude)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
-        """Return the smoother step: the law of the state before given the one after, and that after the update."""
+        """Return what a Rauch-Tung-Striebel pass needs of a step: x after the update, and x before it given x+."""
         return smoother_step_by_transform(self, step, self)
 
 
@@ -115,10 +113,15 @@ def second_moments_at_start(plant: AnyPlant, start: HasInitialMoments | None = N
 
 
 def factor_process_noise(plant: AbstractPlant, u: jax.Array, initial_power: jax.Array) -> WeightedColumns:
-    """Return factors of Cov w plus the covariance of rounding, for a state of second moments `initial_power` (n,).
+    """Return factors L diag(d) L' of Cov w, to which the covariance of the state's rounding is added.
 
-    A number of second moment s has a rounding with the variance of some eps^2 s. With it no covariance becomes singular
-    by rounding.
+    A number of second moment s has a rounding with the variance of some eps^2 s; s is `initial_power` (n,), E[x_i^2] at
+    the start, plus Var w_i. With it no covariance becomes singular by rounding.
+
+    Args:
+        plant: x+ = f(x, u) + w; Cov w may depend on u.
+        u: input of the step.
+        initial_power: E[x_i^2] before any data (n,).
     """
     noise = plant.noise.columns if isinstance(plant.noise, AbstractNoise) else columns_of(plant.noise_covariance(u))
     rounding = rounding_of(initial_power + diagonal(plant.noise_covariance(u)))
@@ -130,11 +133,13 @@ def factor_process_noise(plant: AbstractPlant, u: jax.Array, initial_power: jax.
 def find_transition_moments(plant: AbstractPlant, transform: AbstractTransform, x: Gaussian, u: jax.Array) -> Image:
     """Return the moments of f(x, u), exactly where it is linear, else by the transform.
 
-    An image holds the mean of f, its slopes in the factors of x, and the covariance that the slopes do not explain.
+    An `Image` holds the mean of f, its slopes S in xi of x = m + L xi, and columns of the covariance of the rest,
+    f - E f - S xi.
     """
     if isinstance(plant, LinearPlant):
         return linear_image(plant.transition_matrix(u), plant.transition(x.mean, u), x)
-    return transform_about_mean(plant, transform, x, u)[1]
+    _, image = transform_about_mean(plant, transform, x, u)
+    return image
 
 
 def predict_gaussian(
@@ -142,8 +147,9 @@ def predict_gaussian(
 ) -> Gaussian:
     """Return the Gaussian of f(x, u) + w from that of x.
 
-    `initial_power` (n,) is E[x_i^2] before any data, the size of the numbers that are rounded. `settle` turns attitudes
-    back to their group about `middle`, the state about which moments are taken.
+    `initial_power` (n,) is E[x_i^2] before any data, the size of the numbers that are rounded. Where states are
+    attitudes, the transform's moments are those of f = middle + change; `settle` makes of them a mean on the group of
+    rotations, and a covariance of changes from it. Elsewhere `settle` returns its argument.
     """
     noise = factor_process_noise(plant, u, initial_power)
     if isinstance(plant, LinearPlant):
@@ -182,12 +188,18 @@ class PredictsByTransform(Protocol):
 def smoother_step_by_transform(filter: PredictsByTransform, step: StepTrace, start: HasInitialMoments) -> SmootherStep:
     """Return the smoother step of x+ = f(x, u) + w, with the moments of f by the filter's transform.
 
-    `start` is the plant or filter whose initial law gives the size of rounded numbers. `unexplained` is the covariance
-    of x+ that the slopes of f in x do not explain.
+    The backward pass regresses x on x+ = E f + S xi + rest for x = m + L xi: it needs the slopes S, and columns of the
+    covariance of the rest (`unexplained`), the curvature of f and w.
+
+    Args:
+        filter: with plant, transform and claim.
+        step: the states before the step, after its prediction and after its update, with u and k.
+        start: plant or filter whose initial law gives the size of the numbers that are rounded.
     """
     plant, u = at(filter.plant, step.k), jnp.asarray(step.u)
     image = find_transition_moments(plant, filter.transform, gaussian_of(step.before), u)
-    unexplained = sum_unexplained(image, factor_process_noise(plant, u, second_moments_at_start(filter.plant, start)))
+    noise = factor_process_noise(plant, u, second_moments_at_start(filter.plant, start))
+    unexplained = sum_unexplained(image, noise)
     return smoother_step_of(step, (image.slopes, unexplained), filter.claim, plant.manifold)
 
 
@@ -212,13 +224,13 @@ class OpenLoop(AbstractGaussianStateFilter):
 
     @property
     def attitude(self) -> Angles:
-        """Return the indices of the plant's attitudes, which it turns."""
+        """Return the indices of states that are attitudes (rotations), so that the estimate reports them as such."""
         indices: Angles = first(self.plant).manifold.rotations
         return indices
 
     @corrects
     def correct(self, state: Gaussian, z: ArrayLike, k: Step = 0) -> tuple[Gaussian, Innovation]:
-        """Return the state as it is, whatever the length of z."""
+        """Return the predicted state as it is, and no innovation: this filter uses no measurement z."""
         return state, no_innovation()
 
 

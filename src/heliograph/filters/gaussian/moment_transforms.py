@@ -60,9 +60,9 @@ class AbstractTransform(Module):
         return Transformed(image.mean, image.columns.covariance, cross_covariance)
 
     def image(self, function: Function, x: Gaussian) -> Image:
-        """Return the moments of f(x) as slopes in xi of x = m + L xi, and a rest uncorrelated with xi.
+        """Return the moments of f(x) = E f + S xi + rest for x = m + L xi: E f, the slopes S, and columns of Cov(rest).
 
-        By default from `apply`.
+        The rest is uncorrelated with xi. By default they follow from E f, Cov f and Cov(x, f), which `apply` returns.
         """
         return image_of_moments(self.apply(function, x.mean, jnp.asarray(x.covariance)), x)
 
@@ -74,8 +74,8 @@ def image_of_moments(moments: Transformed, x: Gaussian) -> Image:
     """
     slopes = decorrelate(x.root, moments.cross).T * reciprocal_or_zero(x.variances)
     if writes_for_derivatives():  # a quotient of numbers of which only rounding is left has no digits of its derivative
-        known = x.variances <= (KNOWN * unit_of(slopes)) ** 2 * (x.mean**2 + diagonal(x.covariance))
-        slopes = spoil_derivatives(slopes, known | (x.variances < SMALLEST))
+        is_rounding = x.variances <= (KNOWN * unit_of(slopes)) ** 2 * (x.mean**2 + diagonal(x.covariance))
+        slopes = spoil_derivatives(slopes, is_rounding | (x.variances < SMALLEST))  # derivatives NaN there
     unexplained = moments.covariance - (slopes * x.variances) @ slopes.T
     return image_by_slopes(moments.mean, slopes, x, eliminate(unexplained))
 
@@ -98,6 +98,7 @@ class Cubature(AbstractTransform):
         the curvature. Both have the weights 1 / (4 n).
         """
         n = len(x.mean)
+        # Where the program is differentiated: the same parts, in a form that has derivatives where a d_j is 0.
         if writes_for_derivatives():
             parts = find_odd_and_even_parts(function, x, n)
             middle = jnp.sum(parts.even, axis=1) / n
@@ -121,7 +122,7 @@ def evaluate_beside_mean(function: Function, x: Gaussian, steps: jax.Array) -> t
     offsets = x.root @ jnp.diag(steps)  # a matrix product: the zeros of L stay zeros
     points = jnp.concatenate([x.mean[:, None] + offsets, x.mean[:, None] - offsets], axis=1)
     values = evaluate_at_points(function, points.T).T
-    ahead, behind = jnp.split(values, 2, axis=1)
+    ahead, behind = jnp.split(values, 2, axis=1)  # at m + step_j L_j, at m - step_j L_j
     return ahead, behind
 
 
@@ -140,7 +141,11 @@ class Linearization(AbstractTransform):
 
 
 def linear_image(matrix: Array, mean: jax.Array, x: Gaussian) -> Image:
-    """Return the image of a linear function with this matrix and this value at the mean, exact by every transform."""
+    """Return the moments of an affine function f(x) = F x + b, exact under every transform.
+
+    With x = m + L xi, f has the mean F m + b and the slopes F L in xi, and no curvature. F is `matrix` (p, n), and
+    `mean` the value F m + b (p,).
+    """
     return image_by_slopes(mean, jnp.asarray(matrix @ x.root), x)
 
 
@@ -172,7 +177,7 @@ class PolynomialMoments(AbstractTransform):
         For degree 2 they come from the polynomial's coefficients, else from Gauss-Hermite quadrature.
         """
         deviations = square_root(x.variances)
-        factor = x.root @ jnp.diag(deviations)
+        factor = x.root @ jnp.diag(deviations)  # x = m + factor zeta, zeta standard normal
         if self.degree == 2 and writes_for_derivatives():
             return find_quadratic_image(function, x)
         if self.degree == 2:
@@ -180,9 +185,9 @@ class PolynomialMoments(AbstractTransform):
         points, weights = map(jnp.asarray, _hermite_grid(x.mean.shape[0], self.degree + 1))
         if writes_for_derivatives():
             return find_grid_image(function, x, points, weights)
-        values = evaluate_at_points(function, x.mean + points @ factor.T).T
-        center = values @ weights
-        slopes = (values * weights) @ points  # in units of each deviation
+        values = evaluate_at_points(function, x.mean + points @ factor.T).T  # (p, points)
+        center = values @ weights  # E f
+        slopes = (values * weights) @ points  # E[f zeta']: the slopes for a change of one deviation
         # The differences between f and its best linear fit, at each point.
         residuals = values - center[:, None] - slopes @ points.T
         explained = WeightedColumns(slopes, np.ones(len(deviations)))
@@ -201,8 +206,10 @@ def _quadratic_image(function: Function, mean: jax.Array, factor: jax.Array, dev
     rows, columns = np.triu_indices(n, 1)
     points = [center, center + factor, center - factor, center + factor[:, rows] + factor[:, columns]]
     values = evaluate_at_points(function, jnp.concatenate(points, axis=1).T).T
+    # f at m (p, 1), at m + L_i (p, n), at m - L_i (p, n), and at m + L_i + L_j (p, pairs).
     start, ahead, behind, cross = jnp.split(values, [1, n + 1, 2 * n + 1], axis=1)
-    slopes, squares = (ahead - behind) / 2, (ahead + behind) / 2 - start  # a_i and b_i
+    slopes = (ahead - behind) / 2  # a_i
+    squares = (ahead + behind) / 2 - start  # b_i
     mixed = cross - ahead[:, rows] - ahead[:, columns] + start  # b_ij
     weights = np.concatenate([np.full(n, 2.0), np.ones(len(rows))])
     curvature = WeightedColumns(jnp.concatenate([squares, mixed], axis=1), weights)
@@ -211,9 +218,10 @@ def _quadratic_image(function: Function, mean: jax.Array, factor: jax.Array, dev
 
 
 def _hermite_grid(dimension: int, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the points (count^dimension, dimension) and weights of the tensor rule for a standard normal vector.
+    """Return the points (count^dimension, dimension) and weights of Gauss-Hermite's rule for a standard normal vector.
 
-    POINT_LIMIT: most points, 20,000.
+    `count` points in each direction: all combinations of them, with the products of their probabilities as weights.
+    More than POINT_LIMIT points, 20,000, are refused.
     """
     if count**dimension > POINT_LIMIT:
         raise fail("points of the exact-moment rule", f"at most {POINT_LIMIT:,}", f"{count}^{dimension}")

@@ -24,15 +24,17 @@ from heliograph.numerics.types import Array
 
 Function = Callable[[jax.Array], jax.Array]
 
-NODE = 1 / np.sqrt(6)  # of a step: where the derivatives are taken
-NEARLY_LINEAR = 1e-3  # share of f' that f'' adds over a step, its square that f''' adds: its fourth power is none
+NODE = 1 / np.sqrt(6)  # share of a step at which the derivatives are taken: the nodes of the integrals above
+NEARLY_LINEAR = (
+    1e-3  # over a step f'' adds at most this share of f', and f''' its square: what is neglected, its fourth
+)
 
 
 class Parts(NamedTuple):
-    """f about m in the columns L_j of x = m + L xi, for steps s_j.
+    """A function f about m, along the columns L_j of x = m + L xi, with a step s_j in each.
 
-    Shapes: here f(m) (p,), slopes (p, n), the odd part over 2 s_j; even (p, n), f at both points less 2 f(m); linear
-    (p, n), whether f is nearly linear over the step.
+    `here` is f(m) (p,), `slopes` (f(m + s_j L_j) - f(m - s_j L_j)) / (2 s_j) (p, n), `even` f(m + s_j L_j) +
+    f(m - s_j L_j) - 2 f(m) (p, n), and `linear` (p, n) says whether f is nearly linear over the step.
     """
 
     here: jax.Array
@@ -42,15 +44,23 @@ class Parts(NamedTuple):
 
 
 def find_odd_and_even_parts(function: Function, x: Gaussian, scale: Array | float) -> Parts:
-    """Return f at the mean, and its odd and even parts at m +- sqrt(scale d_j) L_j."""
+    """Return f at the mean m of x = m + L xi, and its odd and even parts over the steps s_j = sqrt(scale d_j).
+
+    `slopes` are (f(m + s_j L_j) - f(m - s_j L_j)) / (2 s_j), `even` f(m + s_j L_j) + f(m - s_j L_j) - 2 f(m).
+    """
     mean, variances = x.mean, x.variances
     steps, here = square_root(scale * variances), function(mean)
 
     def of_column(column: jax.Array, step: jax.Array, variance: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Return slopes, even part and `linear` in one column L_j, by values at two points, or by derivatives."""
+        """Return slopes, even part and `linear` (p,) in one column L_j, by values at two points, or by derivatives.
+
+        By derivatives where a component of f is nearly linear over the step s. With g(t) = f(m + t s L_j) both are
+        integrals of g' and g'' over t, taken with the nodes 0 and +- 1 / sqrt 6.
+        """
         _, slope_here = jax.jvp(function, (mean,), (column,))
-        at = [differentiate_twice(function, mean + sign * NODE * step * column, column) for sign in (1, -1)]
-        (slope_ahead, bend_ahead), (slope_behind, bend_behind) = at
+        slope_ahead, bend_ahead = differentiate_twice(function, mean + NODE * step * column, column)
+        slope_behind, bend_behind = differentiate_twice(function, mean + -NODE * step * column, column)
+        # Nearly linear: s |f''| and s^2 |f'''| are small shares of |f'|.
         bend = jnp.maximum(jnp.abs(bend_ahead), jnp.abs(bend_behind))
         slope = jnp.maximum(jnp.abs(slope_here), jnp.maximum(jnp.abs(slope_ahead), jnp.abs(slope_behind)))
         twist = jnp.abs(bend_ahead - bend_behind) / (2 * NODE)  # s f'''
@@ -66,7 +76,7 @@ def find_odd_and_even_parts(function: Function, x: Gaussian, scale: Array | floa
 
 
 def differentiate_twice(function: Function, at: jax.Array, direction: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return f'(x)[v] and f''(x)[v, v]."""
+    """Return f'(x)[v] and f''(x)[v, v] at x = `at`, for the direction v: first and second directional derivative."""
     return jax.jvp(lambda y: jax.jvp(function, (y,), (direction,))[1], (at,), (direction,))
 
 
@@ -84,23 +94,28 @@ def find_quadratic_image(function: Function, x: Gaussian) -> Image:
     rows, columns = np.triu_indices(len(d), 1)
 
     def slopes_at(point: jax.Array) -> jax.Array:
-        """Return f'(x)[L_j] of all columns (p, n)."""
+        """Return f'(point)[L_j] of all columns L_j, as the columns of a matrix (p, n)."""
         differentiate: Any = jax.vmap(lambda column: jax.jvp(function, (point,), (column,))[1], in_axes=1, out_axes=1)
         return jnp.asarray(differentiate(root))
 
     def mixed(i: jax.Array, j: jax.Array) -> jax.Array:
         """Return the coefficient of xi_i xi_j, by values or by slopes in the column over which f is nearly linear."""
-        # By values (`both`): the mixed difference over both steps. By slopes: how the slope in one column changes along
-        # the other; it keeps its digits where the step changes f hardly more than a straight line.
+        # By values: the mixed difference over both steps. By slopes: how the slope in one column changes along the
+        # other; it keeps its digits where the step changes f hardly more than a straight line.
         (at_i, at_j), middle = (mean + deviations[k] * root[:, k] for k in (i, j)), slopes_at(mean)
-        both = function(at_i + deviations[j] * root[:, j]) - function(at_i) - function(at_j) + function(mean)
+        mixed_difference = (
+            function(at_i + deviations[j] * root[:, j]) - function(at_i) - function(at_j) + function(mean)
+        )
         s_i, s_j = (jnp.where(deviations[k] > 0, deviations[k], 1.0) for k in (i, j))
-        by_i, by_j = (slopes_at(at_j) - middle)[:, i] / s_j, (slopes_at(at_i) - middle)[:, j] / s_i
-        return jnp.where(parts.linear[:, j], by_j, jnp.where(parts.linear[:, i], by_i, both / (s_i * s_j)))
+        by_slope_in_i = (slopes_at(at_j) - middle)[:, i] / s_j
+        by_slope_in_j = (slopes_at(at_i) - middle)[:, j] / s_i
+        by_values = mixed_difference / (s_i * s_j)
+        return jnp.where(parts.linear[:, j], by_slope_in_j, jnp.where(parts.linear[:, i], by_slope_in_i, by_values))
 
     mean = x.mean
-    pairs, none = (jnp.asarray(rows), jnp.asarray(columns)), jnp.zeros((len(squares), 0))
-    products = jax.vmap(mixed, out_axes=1)(*pairs) if len(rows) else none
+    # c_ij of all pairs i < j, as columns; of a single state there is none.
+    no_products = jnp.zeros((len(squares), 0))
+    products = jax.vmap(mixed, out_axes=1)(jnp.asarray(rows), jnp.asarray(columns)) if len(rows) else no_products
     weights = jnp.concatenate([jnp.full(len(d), 2.0), d[rows] * d[columns]])
     curvature = WeightedColumns(jnp.concatenate([squares, products], axis=1), weights)
     return Image(parts.here + jnp.sum(squares, axis=1), WeightedColumns(parts.slopes, d), np.ones(len(d)), curvature)
@@ -119,7 +134,10 @@ def find_grid_image(function: Function, x: Gaussian, nodes: jax.Array, weights: 
     deviations = jnp.where(near, 0.0, square_root(d))
 
     def at_point(node: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return the even part of f in the near columns, (p,), and its slopes in all, (p, n)."""
+        """Return f + 1/2 sum_j d_j f''[L_j, L_j] over the near columns j, (p,), and f'[L_j] of all columns, (p, n).
+
+        `node` (n,) is a point of the rule; near columns stay at their mean.
+        """
         point = x.mean + root @ (deviations * node)
         slopes, bends = jax.vmap(lambda column: differentiate_twice(function, point, column), in_axes=1)(root)
         return function(point) + jnp.where(near, d / 2, 0.0) @ bends, slopes.T

@@ -47,15 +47,15 @@ class PlantAboutCenter(AbstractPlant):
     inputs: tuple[str, ...] = eqx.field(static=True)
 
     def transition(self, x: jax.Array, u: jax.Array) -> jax.Array:
-        """Return f(center + x, u) - level."""
+        """Return f(center + x, u) - level (n,) for a small deviation x, without the rounding of the large numbers."""
         return _evaluate_about(lambda y: self.model.transition(y, u), x, self.center, self.level, self.unit)
 
     def noise_covariance(self, u: jax.Array) -> jax.Array:
-        """Return the covariance of w."""
+        """Return Cov w (n, n), that of the plant itself: a noise is the same whatever the origin."""
         return self.model.noise_covariance(u)
 
     def noise_mean(self) -> jax.Array:
-        """Return the mean of w."""
+        """Return E w (n,), that of the plant itself."""
         return self.model.noise_mean()
 
 
@@ -77,7 +77,7 @@ class SensorAboutCenter(AbstractSensor):
     outputs: tuple[str, ...] = eqx.field(static=True)
 
     def measure(self, x: jax.Array) -> jax.Array:
-        """Return h(center + x) - level."""
+        """Return h(center + x) - level (p,) for a small deviation x, without the rounding of the large numbers."""
         return _evaluate_about(self.model.measure, x, self.center, self.level, self.unit)
 
 
@@ -97,8 +97,9 @@ def _evaluate_about(
 
     @evaluate.defjvp
     def _(primals: tuple[jax.Array], tangents: tuple[jax.Array]) -> tuple[jax.Array, jax.Array]:
-        """Differentiate f(center + e) by e, as f is written: rounding errors have no derivative."""
-        return evaluate(*primals), jax.jvp(lambda e: function(center + e), primals, tangents)[1]
+        """Return the value at e, and its derivative along a tangent: that of f(center + e), without rounding errors."""
+        _, derivative = jax.jvp(lambda e: function(center + e), primals, tangents)
+        return evaluate(*primals), derivative
 
     value: jax.Array = evaluate(e)
     return value
@@ -129,12 +130,15 @@ class CentredFilter(AbstractWrapper):
 
     @property
     def attitude(self) -> Angles:
-        """No attitudes: plants that have some are not treated about an origin."""
+        """Indices of attitudes among the states: none, since plants with attitudes are not treated about an origin."""
         return ()
 
     @in_float64
     def init(self) -> SplitMeanGaussian:
-        """Return the prior: the origin `high` is the mean rounded to single precision, and the rest is a deviation."""
+        """Return the base filter's prior about an origin: its mean rounded to single precision (`high`).
+
+        The rest of the mean, `low`, is the mean of the deviation e = x - high.
+        """
         return center_known(self.base.init())
 
     @predicts
@@ -191,7 +195,7 @@ class CentredFilter(AbstractWrapper):
         return Estimate(mean, state.about_center.covariance, self.claim)
 
     def after_step(self, state: SplitMeanGaussian, k: Step) -> Estimate:
-        """Return mean and covariance after step k."""
+        """Return the mean and covariance after step k, as `estimate` does: nothing is looked up by k."""
         return self.estimate(state)
 
 
@@ -213,7 +217,11 @@ def make_moving_origin_filter(filter: AbstractGaussianStateFilter) -> AbstractFi
 
 
 def _start_at_zero(base: Any) -> Any:
-    """Return the filter with an initial mean of 0, so that its numbers are as large as its deviations."""
+    """Return a copy of the filter with an initial mean of 0.
+
+    Filters take the rounding of their numbers from the second moments at the start. Deviations from an origin begin at
+    0, so that only the initial covariance counts.
+    """
     return eqx.tree_at(lambda f: f.initial_mean, base, np.zeros(np.shape(base.initial_mean)))
 
 

@@ -92,7 +92,7 @@ class GivingInFilter(AbstractSizedFilter):
     seconds: float | None = eqx.field(static=True)
 
     def angles_used(self) -> FilterAngles:
-        """Return the angles of the gate."""
+        """Return the indices of states and of received numbers that are angles: those of the filter with the gate."""
         return self.base.angles_used()
 
     @compile_on_call
@@ -173,10 +173,10 @@ class GivingInFilter(AbstractSizedFilter):
         return belief, _select_tree(gives_in, rival_innovation, innovation)
 
     def _is_refused_long(self, refused: jax.Array, elapsed: jax.Array) -> jax.Array:
-        """Return whether some number has been refused often enough in a row, or for long enough.
+        """Return whether the gate has left out some number often enough in a row, or for long enough, to be doubted.
 
-        `refused` (m,) counts the refusals in a row of each received number, and `elapsed` is the time since the first.
-        `self.after` and `self.seconds` are the limits of the gate's rule; None means no limit.
+        `refused` (m,) counts how often in a row each received number was left out, and `elapsed` is the time since the
+        first of these. `self.after` and `self.seconds` are the limits that the user gave; None means no limit.
         """
         is_long = jnp.zeros((), dtype=bool)
         if self.after is not None:
@@ -209,17 +209,22 @@ class GivingInFilter(AbstractSizedFilter):
         return from_columns(predicted.prior.mean, join_columns(predicted.prior.columns, wider))
 
     def _compare_densities(self, rival: Innovation, gate: Innovation, counts: jax.Array) -> jax.Array:
-        """Return the summed log density of some numbers under the rival, the alternative estimate, minus the gate's.
+        """Return sum_i log p_rival(z_i) - log p_gate(z_i) over some numbers: evidence for the rival estimate.
 
-        `counts` (m,) says which numbers. Squares of innovations, over their variances, are clipped at the gate's limit
-        c, so that no outlier decides alone.
+        The gate leaves out numbers z_i far from its prediction; the rival is a second estimate that uses them too. The
+        numbers which neither leaves out tell which of the two is right. Squared innovations over their variances are
+        clipped at the gate's limit c (it accepts e^2 / S <= c), so that no outlier decides alone.
+
+        Args:
+            rival: innovation of z under the rival estimate.
+            gate: innovation of the same z under the gate's estimate.
+            counts: which numbers are compared (m,).
         """
 
         def log_density(innovation: Innovation) -> jax.Array:
-            """Return each number's log density under its Gaussian, without the 2 pi term.
+            """Return -(min(e^2 / S, c) + log S) / 2 of each number (m,), with innovation e and variance S.
 
-            It is 0 for numbers that are not compared, where `counts` (m,) is False. The squared innovation over its
-            variance is clipped at the gate's limit c.
+            It is 0 for numbers that are not compared, where `counts` (m,) is False.
             """
             variance = jnp.diagonal(jnp.asarray(innovation.covariance))
             variance = jnp.where(counts, variance, 1.0)
@@ -260,7 +265,10 @@ def _find_most_probable_change(predicted: PredictedMeasurement, e: jax.Array, of
 
 
 def _get_gate_rule(base: RobustFilter) -> Gate:
-    """Return the rule of a filter whose rule is a gate."""
+    """Return the rule of a filter that was built with a `Gate`: it accepts innovations with e^2 <= c S.
+
+    `base.rule` may be any weighting rule by its type; only a gate is built into a `GivingInFilter`.
+    """
     assert isinstance(base.rule, Gate)
     return base.rule
 
@@ -271,17 +279,20 @@ def _select_tree(condition: jax.Array, if_true: Any, if_false: Any) -> Any:
 
 
 def build_giving_in_filter(base: RobustFilter, rule: Gate) -> GivingInFilter:
-    """Return the filter whose gate adopts an alternative estimate after the refusals that its rule allows.
+    """Return a filter that recovers when its gate has locked out right measurements.
+
+    A gate leaves out numbers far from its prediction; after a jump of the state it would leave out all. So a second
+    estimate, which also uses them, runs beside it. After `rule.after` rejections in a row, or `rule.seconds` of them,
+    the second estimate replaces the first. What the covariance is after that is approximate: the claim is "nominal".
 
     Args:
         base: the filter with the gate.
-        rule: the gate's rule, with its limits `after` and `seconds`.
+        rule: the gate, with its limits `after` and `seconds`.
 
     Raises:
         ValueError: seconds of a plant without the input dt.
     """
     if rule.seconds is not None and TIME_STEP not in base.inputs:
         raise fail("seconds of a gate", f"a plant with the input {TIME_STEP!r}, or after= refusals", list(base.inputs))
-    return GivingInFilter(
-        base=base, after=rule.after, seconds=rule.seconds, **make_sizes("nominal", base, base.received)
-    )
+    sizes = make_sizes("nominal", base, base.received)  # claim, names of states and inputs, length of z
+    return GivingInFilter(base=base, after=rule.after, seconds=rule.seconds, **sizes)

@@ -54,7 +54,7 @@ class Huber(AbstractWeightingRule):
         self.c = scalar("constant of Huber's rule", c, low=TINY)
 
     def weights(self, e: jax.Array, squared: jax.Array, scale: jax.Array) -> jax.Array:
-        """Return min(1, c / |d|)."""
+        """Return min(1, c / |d|) of each component (m,); `squared` is d^2, the innovation squared over its variance."""
         within = squared <= self.c**2
         return jnp.where(within, 1.0, self.c / jnp.sqrt(jnp.where(within, 1.0, squared)))
 
@@ -73,7 +73,10 @@ class InverseMultiquadric(AbstractWeightingRule):
         self.c = scalar("constant of the inverse multiquadric rule", c, low=TINY)
 
     def weights(self, e: jax.Array, squared: jax.Array, scale: jax.Array) -> jax.Array:
-        """Return 1 / (1 + d^2 / c^2)."""
+        """Return 1 / (1 + d^2 / c^2) of each component (m,).
+
+        `squared` is d^2, the squared innovation over its variance.
+        """
         return 1 / (1 + squared / self.c**2)
 
 
@@ -90,7 +93,7 @@ class WoLF(AbstractWeightingRule):
         self.c = scalar("constant of the weighted likelihood filter", c, low=TINY)
 
     def weights(self, e: jax.Array, squared: jax.Array, scale: jax.Array) -> jax.Array:
-        """Return 1 / (1 + e^2 / (c^2 r))."""
+        """Return 1 / (1 + e^2 / (c^2 r)) of each component (m,), for innovations e and noise variances r (`scale`)."""
         return 1 / (1 + e**2 / (self.c**2 * scale))
 
 
@@ -129,7 +132,10 @@ class Gate(AbstractWeightingRule):
         return self.after is not None or self.seconds is not None
 
     def weights(self, e: jax.Array, squared: jax.Array, scale: jax.Array) -> jax.Array:
-        """Return 1 where d^2 (`squared`) is at most c, else 0."""
+        """Return 1 where d^2 is at most c (used in full), else 0 (left out).
+
+        `squared` is d^2, the squared innovation of each component over its variance (m,).
+        """
         return jnp.where(squared <= self.c, 1.0, 0.0)
 
 
@@ -155,7 +161,7 @@ class StudentVB(AbstractWeightingRule):
     def of_law(self, degrees: Degrees) -> "StudentVB":
         """Return the same rule with the degrees of freedom of each received component's Student law."""
         rule = StudentVB(self.iterations)
-        object.__setattr__(rule, "degrees", degrees)  # fields are frozen
+        object.__setattr__(rule, "degrees", degrees)  # past the check that fields of a built object are not assigned
         return rule
 
     def iterate(
@@ -198,7 +204,7 @@ class RobustFilter(AbstractGaussianStateFilter):
     received_angles: Angles = eqx.field(static=True)
 
     def angles_used(self) -> FilterAngles:
-        """Return the angles of its plant, and those that its channel delivers."""
+        """Return the indices of states that are angles, and of components of z that are."""
         return FilterAngles(first(self.plant).angles, self.received_angles)
 
     @corrects
@@ -221,11 +227,18 @@ class RobustFilter(AbstractGaussianStateFilter):
         return after.state, _innovation_about_mean(predicted, z, noise.center, noise.covariance, after)
 
     def for_single_precision(self) -> AbstractFilter:
-        """Return the filter about an origin that moves."""
+        """Return the same filter of small deviations from an origin that moves with the estimate.
+
+        Far from zero, single precision would round a state by more than its deviation; deviations keep their digits.
+        """
         return make_moving_origin_filter(self)
 
     def predict_received(self, state: Gaussian, k: Step) -> tuple[PredictedMeasurement, jax.Array]:
-        """Return the prediction of z without the noise that may hold outliers, and the sensor's mean signal."""
+        """Return the prediction of t, where z = t + the noise that may hold outliers, and E h(x) with the noise's mean.
+
+        t is what the channel makes of the sensor's signal, with all other noise. The mean of the signal is needed where
+        the gain is random: then it scales the noise's law.
+        """
         sensor, channel = at(self.sensor, k), at(self.channel, k)
         initial_power = second_moments_at_start(self.plant, self)
         signal = signal_without_noise(at(self.plant, k), sensor, self.transform, state, initial_power)
@@ -239,9 +252,16 @@ def signal_without_noise(
     state: Gaussian,
     initial_power: jax.Array,
 ) -> Signal:
-    """Return the moments of h(x) and the mean of its noise, without the noise's spread.
+    """Return the moments of the sensor's signal with the mean of its noise, but without the noise's covariance.
 
-    `initial_power` (n,) is E[x_i^2] before any data, the size of the numbers that are rounded.
+    The noise's law is weighed apart, as it may hold outliers.
+
+    Args:
+        plant: the plant, whose states may be angles or attitudes.
+        sensor: gives h(x), and the mean of its noise.
+        transform: moments of a nonlinear h.
+        state: the predicted Gaussian of x.
+        initial_power: E[x_i^2] before any data (n,), the size of the numbers that are rounded.
     """
     no_noise = zero_covariance(len(sensor.outputs))
     return find_signal_moments(plant, sensor, transform, state, initial_power, no_noise)
@@ -250,13 +270,16 @@ def signal_without_noise(
 def predict_behind_channel(signal: Signal, channel: SecondOrder) -> PredictedMeasurement:
     """Return the mean, slopes and noise of t = G y + n, what a channel makes of the signal y.
 
-    With M = E G and b = E n the mean is M E y + b, and the slopes are M times those of y. The noise is that of n and
-    that of the spread of G.
+    With M = E G and b = E n the mean is M E y + b, and the slopes are M times those of y. The noise is that of n, that
+    of y, and (G - M) y: what a random gain adds.
     """
-    gain = jnp.asarray(channel.mean_gain)
-    mean = gain @ signal.mean + channel.offset
-    slopes, noise = gain @ signal.slopes, make_received_noise(signal, channel)
-    return PredictedMeasurement(signal.prior, mean, slopes, noise)
+    gain = jnp.asarray(channel.mean_gain)  # M
+    return PredictedMeasurement(
+        prior=signal.prior,
+        signal=gain @ signal.mean + channel.offset,
+        slopes=gain @ signal.slopes,
+        noise=make_received_noise(signal, channel),
+    )
 
 
 def _innovation_about_mean(

@@ -21,7 +21,11 @@ from heliograph.numerics.types import ArrayLike
 
 
 def _student_degrees_of(noise: ReceivedNoise) -> Vector:
-    """Return the degrees of freedom of each component's Student law; raise ValueError if one has another law."""
+    """Return the degrees of freedom (m,) of the Student law of each received component's noise.
+
+    Raises:
+        ValueError: a component has another law, for which `degrees` is NaN. Traced numbers cannot be looked at.
+    """
     if not is_traced(noise.degrees) and np.isnan(noise.degrees).any():  # NaN: not of Student's law
         raise fail("StudentVB", "noise of Student's law (StudentT) in each component", "another law")
     degrees: Vector = noise.degrees

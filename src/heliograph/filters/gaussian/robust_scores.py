@@ -231,5 +231,5 @@ def expected_branch_precision(
 
 
 def _stack_entries(entries: list[jax.Array]) -> jax.Array:
-    """Return scalars as an array (m,), of length 0 where there are none."""
+    """Stack m scalars to an array (m,); `jnp.stack` refuses an empty list, of which an empty array is returned."""
     return jnp.stack(entries) if entries else jnp.zeros(0)

@@ -44,27 +44,28 @@ class SequentialFilter(AbstractSizedFilter):
 
     def angles_used(self) -> FilterAngles:
         """Return the angles of the plant, and those of all nodes' measurements, one after another."""
-        # Index of each node's first number among all that are received.
-        first_rows = np.cumsum([0, *(filter.received for filter in self.filters)]).tolist()[:-1]
+        # Index of each node's first number in z, which joins the nodes' measurements.
+        starts = np.cumsum([0, *(filter.received for filter in self.filters)]).tolist()[:-1]
         angles_by_node = [filter.angles_used() for filter in self.filters]
-        received = [
-            first_row + i for first_row, angles in zip(first_rows, angles_by_node, strict=True) for i in angles.received
-        ]
+        received = [start + i for start, angles in zip(starts, angles_by_node, strict=True) for i in angles.received]
         return FilterAngles(angles_by_node[0].states, tuple(received))
 
     @in_float64
     def init(self) -> Gaussian:
-        """Return the first node's prior."""
+        """Return the Gaussian of x before any data: the first node's, as all nodes observe one plant."""
         return self.filters[0].init()
 
     @predicts
     def predict(self, state: Gaussian, u: ArrayLike = (), k: Step = 0) -> Gaussian:
-        """Predict with the first node's filter."""
+        """Predict x over one step with the first node's filter; all nodes observe the same plant."""
         return self.filters[0].predict(state, u, k)
 
     @corrects
     def correct(self, state: Gaussian, z: ArrayLike, k: Step = 0) -> tuple[Gaussian, Innovation]:
-        """Correct with each node's measurement in turn; z holds the measurements of all nodes, one after another."""
+        """Correct with each node's measurement in turn: the posterior of one node is the prior of the next.
+
+        z holds the measurements of all nodes, one after another. The innovations are joined likewise.
+        """
         z = jnp.asarray(z)
         if all(have_same_structure(filter, self.filters[0]) for filter in self.filters):
             return self._correct_in_one_loop(state, z, k)
@@ -77,7 +78,11 @@ class SequentialFilter(AbstractSizedFilter):
         return state, _join_innovations(innovations)
 
     def _correct_in_one_loop(self, state: Gaussian, z: jax.Array, k: Step) -> tuple[Gaussian, Innovation]:
-        """Correct as `correct` does, by a loop over nodes whose filters have one structure: it is compiled once."""
+        """Correct with the measurement of node after node, as `correct` does, by one loop over the nodes.
+
+        The filters of all nodes have the same structure here and differ only in their arrays, so that the loop's body
+        is compiled once. `z` joins measurements of equal length.
+        """
         # `arrays`: what differs from node to node, stacked; `rest`: what all filters share.
         arrays, rest = eqx.partition(stack(self.filters), eqx.is_array)
 
@@ -93,12 +98,12 @@ class SequentialFilter(AbstractSizedFilter):
 
     @estimates
     def estimate(self, state: Gaussian) -> Estimate:
-        """Return the mean and covariance of the belief, by the first node's filter."""
+        """Return the mean and covariance of x, with this filter's claim instead of that of the first node's filter."""
         posterior = self.filters[0].estimate(state)
         return Estimate(posterior.mean, posterior.covariance, self.claim)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
-        """Return the smoother step around all nodes' updates."""
+        """Return what a backward pass needs of a step: the prediction is the first node's, `step.after` all nodes'."""
         return replace(smoother_step_by_transform(self.filters[0], step, self.filters[0]), claim=self.claim)
 
 

@@ -61,12 +61,12 @@ class Signal(NamedTuple):
 
     @property
     def covariance(self) -> jax.Array:
-        """Covariance Cov y (p, p) of the signal, with the sensor's noise."""
+        """Cov y = slopes diag(d) slopes' + Cov v (p, p), d the variances of xi in the prior x = m + L xi."""
         return join_columns(WeightedColumns(self.slopes, self.prior.variances), self.noise).covariance
 
     @property
     def cross(self) -> jax.Array:
-        """Cross-covariance Cov(x, y) (n, p) of state and signal."""
+        """Cross-covariance Cov(x, y) = L diag(d) slopes' (n, p) of state and signal."""
         return jnp.asarray((self.prior.root * self.prior.variances) @ self.slopes.T)
 
     def about_mean(self) -> "Signal":
@@ -134,10 +134,16 @@ def make_received_noise(signal: Signal, channel: SecondOrder) -> WeightedColumns
 
 
 def take_link_noise(channel: SecondOrder) -> WeightedColumns:
-    """Return columns of Cov n; of a traced law those with its derivatives, where the program is differentiated."""
+    """Return columns W and weights w of Cov n = W diag(w) W' of a channel z = G y + n.
+
+    Where the program is differentiated by parameters of the noise (its law is traced), the columns are found anew, so
+    that they have derivatives by them also where a variance is 0.
+    """
     if not (writes_for_derivatives() and is_traced(channel.noise)):
         return channel.noise
-    return columns_with_derivatives(channel.nominal.center[..., -1, -1] - channel.gain_covariance[..., -1, -1])
+    # Index -1 is that of the constant 1 in (y, 1), whose factor in z is n.
+    of_noise_and_gain = channel.nominal.center[..., -1, -1]
+    return columns_with_derivatives(of_noise_and_gain - channel.gain_covariance[..., -1, -1])
 
 
 def noise_behind_gain(
@@ -156,14 +162,23 @@ def noise_behind_gain(
 
 
 def factor_gain_noise(gain_covariance: Array, second: jax.Array, mean: jax.Array) -> WeightedColumns:
-    """Return factors of E[(G - M) y y' (G - M)'], m columns, from E[y y'] and E[y]."""
-    return factor_covariance(contract(gain_covariance, augmented_second_moment(second, mean, 1.0)))
+    """Return columns of E[(G - M) y y' (G - M)'] (m, m), the noise that a random gain G of mean M makes of y.
+
+    Args:
+        gain_covariance: Cov of the entries of (G, n), (m, m, p + 1, p + 1): entry [i, j, a, b] is Cov(G_ia, G_jb). The
+            last a and b, p, stand for the constant 1 below y, whose factor is the noise n.
+        second: E[y y'] (p, p).
+        mean: E[y] (p,).
+    """
+    Y = augmented_second_moment(second, mean, 1.0)  # of (y, 1)
+    return factor_covariance(contract(gain_covariance, Y))  # sum_ab Cov(G_ia, G_jb) Y_ab
 
 
 def factor_covariance(covariance: jax.Array) -> WeightedColumns:
-    """Return factors of a covariance that was formed as a matrix; each pivot is at least 100 eps of its variance.
+    """Return L and d of a covariance P = L diag(d) L' (m, m) that was computed as a matrix.
 
-    So large is the rounding of a combination that has no variance.
+    Each d_j is raised to at least LOST (100) eps of P_jj: so large is the rounding of a combination of components that
+    has no variance.
     """
     return eliminate(covariance, LOST * unit_of(covariance))
 
@@ -171,7 +186,8 @@ def factor_covariance(covariance: jax.Array) -> WeightedColumns:
 def factor_link_noise(channel: SecondOrder, second: jax.Array, mean: jax.Array) -> WeightedColumns:
     """Return columns of Cov(z given y) = Cov n + E[(G - M) y y' (G - M)'], for z = G y + n.
 
-    `second` is E[y y'] (p, p) and `mean` E y (p,). Moments of the gain G are those of its nominal law.
+    To a receiver who knows y, this is the covariance of what the link adds: of its noise n, and of the random gain G
+    about its mean M. `second` is E[y y'] (p, p) and `mean` E y (p,). Moments of G are those of its nominal law.
     """
     return join_columns(take_link_noise(channel), factor_gain_noise(channel.gain_covariance, second, mean))
 
@@ -188,10 +204,19 @@ def condition_on_received(signal: Signal, channel: SecondOrder, z: ArrivedInnova
 def condition_on_measurement(
     x: Gaussian, slopes: jax.Array, noise: WeightedColumns, z: jax.Array, expected: jax.Array, angles: Angles = ()
 ) -> tuple[Gaussian, Innovation]:
-    """Condition x = m + L xi on z = expected + slopes xi + noise, NaN where a component did not arrive.
+    """Condition x = m + L xi on the linear measurement z = expected + slopes xi + noise: Kalman's update.
 
-    `angles` are the components of z that are angles. The innovation's covariance is NaN in the rows and columns of
-    missing components.
+    Args:
+        x: the prior.
+        slopes: of z in xi (m, n): H L for z = H x + noise.
+        noise: columns of the noise's covariance.
+        z: measurement (m,), NaN where a component did not arrive.
+        expected: E z (m,).
+        angles: components of z that are angles; they are taken within half a turn of what was expected.
+
+    Returns:
+        The posterior, and the innovation z - E z with its covariance (NaN in rows and columns of missing components)
+        and its Gaussian log-likelihood.
     """
     present = ~jnp.isnan(z)
     z = wrap_near(z, expected, angles)
@@ -214,7 +239,11 @@ def innovation_covariance(signal: Signal, channel: SecondOrder) -> jax.Array:
 
 
 def augmented_second_moment(second: jax.Array, mean: jax.Array, last: float) -> jax.Array:
-    """Return E[(y, 1)(y, 1)'] from E[y y'] and E[y], with `last` as its last entry, which is 1 or is set to 0."""
+    """Return E[(y, 1)(y, 1)'] (p + 1, p + 1) from E[y y'] (p, p) and E[y] (p,).
+
+    Moments of a channel z = G y + n are maps of this matrix: the 1 is multiplied by n. Its last entry E[1] is `last`:
+    1, or 0 where the noise n is counted elsewhere.
+    """
     top = jnp.concatenate([second, mean[:, None]], axis=1)
     bottom = jnp.concatenate([mean, jnp.full(1, last, mean.dtype)])
     return jnp.concatenate([top, bottom[None]])

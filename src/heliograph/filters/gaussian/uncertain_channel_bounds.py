@@ -51,7 +51,7 @@ class Scalars(Module):
     values: np.ndarray
 
     def __init__(self, first: float, second: float):
-        """Keep the two positive scalars of the covariance bound."""
+        """Keep beta_1 (`first`) and beta_2 (`second`) as an array (2,)."""
         self.values = array("scalars of the bound", [first, second], (2,))
         if np.any(self.values <= 0):
             raise fail("scalars of the bound", "two positive numbers", (first, second))
@@ -65,12 +65,18 @@ def scalars_as_array(scalars: Scalars | None) -> np.ndarray:
 
 
 def scalars_from_array(values: np.ndarray) -> Scalars | None:
-    """Return the scalars from two numbers, None for NaN: the inverse of `scalars_as_array`."""
+    """Return the two scalars as `Scalars`; None for NaN, which stands for scalars to be found at each step.
+
+    The inverse of `scalars_as_array`.
+    """
     return None if np.isnan(values).any() else Scalars(*values)
 
 
 def keep_where_unchanged(changes: jax.Array, after: T, before: T) -> T:
-    """Return `after` where something changes, else `before`."""
+    """Return the tree of arrays `after` where the flag `changes` () holds, else `before`: two forms of one state.
+
+    A measurement of which nothing arrived must leave a state as it is to the last digit.
+    """
     chosen: T = jax.tree.map(lambda a, b: jnp.where(changes, a, b), after, before)
     return chosen
 
@@ -101,6 +107,7 @@ def condition_by_young_bound(signal: Signal, channel: SecondOrder, z: ArrivedInn
     # beta: the scalars that minimise the trace of the bound.
     cross = (slopes * prior.variances) @ prior.root.T  # C
     trace = jnp.trace(prior.covariance)
+    # Arguments of `young_fixed_point_map`: base, shift, mean_part, cross_square and trace.
     terms = base + unit_variance_where_absent(present), shift, of_state + of_noise, cross @ cross.T, trace
     beta = find_trace_minimising_scalars(young_fixed_point_map, scalars, terms)
     a, b = jnp.where(jnp.any(present), 1 + beta[0], 1.0), 1 + beta[1]
@@ -142,12 +149,9 @@ def condition_by_zero_mean_bound(signal: Signal, channel: SecondOrder, z: Arrive
     explained_weights = reciprocal_or_zero(factors.weights)  # 1 / s
     # The beta of least trace, then the update with the noise Omega - M H P H' M'.
     cross = (slopes * prior.variances) @ prior.root.T  # Cov(z, x)
-    terms = (
-        base + unit_variance_where_absent(present),
-        shift,
-        cross @ cross.T,
-        jnp.sum(explained**2 @ explained_weights),
-    )
+    trace_explained = jnp.sum(explained**2 @ explained_weights)  # tr(C Pyy^+ C')
+    # Arguments of `zero_mean_fixed_point_map`: base, shift, cross_square and trace_explained.
+    terms = base + unit_variance_where_absent(present), shift, cross @ cross.T, trace_explained
     beta = find_trace_minimising_scalars(zero_mean_fixed_point_map, scalar, terms)[0]
     noise = factor_covariance(base + shift / beta - of_state)
     after, _ = condition_on_observation(prior, slopes, z.innovation, noise, present)
@@ -173,7 +177,10 @@ def _find_received_slopes_and_covariances(
 
 
 def unit_variance_where_absent(present: jax.Array) -> jax.Array:
-    """Return a diagonal (m, m): 1 for components that did not arrive, so that the system keeps its full size."""
+    """Return a diagonal (m, m) with 1 for components that did not arrive, and 0 for all others.
+
+    Added to a covariance whose rows of missing components are 0, it makes it invertible, without any effect on others.
+    """
     return jnp.diag(jnp.where(present, 0.0, 1.0))
 
 
@@ -184,6 +191,6 @@ def mask_received(channel: SecondOrder, present: jax.Array) -> jax.Array:
     radius (m, m, p+1, p+1). y_a acts on z_i if its entry [i, i, a, a] is not 0.
     """
     m, p = channel.mean_gain.shape[:2]
-    contributes = (channel.power.center != 0) | (channel.power.radius != 0)
+    contributes = (channel.power.center != 0) | (channel.power.radius != 0)  # [i, j, a, b]: of y_a y_b in E[z_i z_j]
     arrived_contributions = [[contributes[i, i, a, a] & present[i] for i in range(m)] for a in range(p)]
     return jnp.stack([jnp.any(jnp.stack(of_component), axis=0) for of_component in arrived_contributions])

@@ -44,7 +44,11 @@ class AbstractUpdate(Module):
     """Rule for bounding the effect of a channel's uncertainty, with the gain that minimises the bound."""
 
     def describe(self, channel: AbstractRandomAffine) -> SecondOrder:
-        """Return the channel's mean gain and its worst cases over the polytope of laws, once before any data."""
+        """Return the moments of z = G y + n that the update works by: called once, before any data.
+
+        They are E G, and bounds of second moments of G and n over all laws that the channel's uncertain probabilities
+        allow (a polytope).
+        """
         return second_order(channel)
 
     def described(self) -> "AbstractUpdate":
@@ -228,7 +232,11 @@ class Interval(AbstractUpdate):
 
 
 class HopRange(NamedTuple):
-    """Range of one hop a g: amplitude a, E g with its radius, the largest E g^2, and its noise's covariance (m, m)."""
+    """Moments of one hop z = a g y + n of a chain, where the law of its random gain g is only known within bounds.
+
+    `amplitude` is a, `mean` E g by the nominal law, `mean_radius` the largest distance of E g from it, `largest_second`
+    the largest E g^2, and `noise` Cov n (m, m).
+    """
 
     amplitude: float
     mean: float
@@ -258,7 +266,7 @@ def _describe_hop(hop: AbstractRandomAffine) -> HopRange:
 
 
 def _is_multiple_of_identity(matrix: jax.Array | np.ndarray) -> bool:
-    """Return whether the matrix is a number times the identity."""
+    """Return whether the matrix is a number times the identity: the hop treats all components alike."""
     return matrix.shape[0] == matrix.shape[1] and bool(np.all(matrix == matrix[0, 0] * np.eye(len(matrix))))
 
 

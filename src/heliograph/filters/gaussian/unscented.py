@@ -91,7 +91,7 @@ class Unscented(AbstractTransform):
         """
         n = x.mean.shape[0]
         self.check(n)
-        alpha, beta, kappa = (jnp.asarray(number) for number in (self.alpha, self.beta, self.kappa))
+        alpha, beta, kappa = jnp.asarray(self.alpha), jnp.asarray(self.beta), jnp.asarray(self.kappa)
         c = alpha**2 * (n + kappa)
         weights = jnp.full(n, 1 / (4 * c))
         weights_with_shift = jnp.append(weights, alpha**2 * kappa / n + beta)

@@ -43,10 +43,12 @@ def find_trace_minimising_scalars(sweep: Sweep, given: Array, parts: Parts) -> j
     free = jnp.isnan(given)
 
     def move(t: jax.Array, refined: jax.Array, slopes: Slopes) -> jax.Array:
-        """Return the scalars' logarithms t after a Newton step for f(t) = t in the free scalars; `refined` is f(t)."""
-        zero_if_given = [
-            [jnp.where(is_free, slope, 0.0) for slope in row] for is_free, row in zip(free, slopes, strict=True)
-        ]
+        """Return t after a Newton step for f(t) = t, with f(t) `refined` and its derivatives `slopes`.
+
+        A scalar that is given does not move: for it both are set so that f(t) = t.
+        """
+        rows = zip(free, slopes, strict=True)
+        zero_if_given = [[jnp.where(is_free, slope, 0.0) for slope in row] for is_free, row in rows]
         return newton_step(t, jnp.where(free, refined, t), zero_if_given)
 
     def goes_on(carry: tuple[jax.Array, jax.Array, jax.Array]) -> jax.Array:
@@ -94,7 +96,10 @@ def newton_step(t: jax.Array, f_of_t: jax.Array, slopes: Slopes) -> jax.Array:
 
 
 def young_omega(beta: jax.Array, base: jax.Array, shift: jax.Array, mean_part: jax.Array) -> jax.Array:
-    """Return Omega = base + (1/beta_1 + 1/beta_2) shift + (1 + beta_2) mean_part."""
+    """Return Omega = base + (1/beta_1 + 1/beta_2) shift + (1 + beta_2) mean_part (m, m), for beta (2,).
+
+    It bounds the covariance of what is received from a channel of uncertain law, for any positive beta_1 and beta_2.
+    """
     return base + (1 / beta[0] + 1 / beta[1]) * shift + (1 + beta[1]) * mean_part
 
 

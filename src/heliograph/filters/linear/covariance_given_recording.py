@@ -50,13 +50,13 @@ class LinearFilterOfRecord(AbstractSizedFilter):
 
     @in_float64
     def init(self) -> RecordedBelief:
-        """Return the filter's prior; before any data, the error covariance given the data is the state's own."""
+        """Return the filter's state before any data, with the covariance of x_0 as that of the estimate's error."""
         own = self.filter.init()
         return RecordedBelief(own, covariance=own.state_covariance)
 
     @predicts
     def predict(self, state: RecordedBelief, u: ArrayLike = (), k: Step = 0) -> RecordedBelief:
-        """Predict the filter's own state, and the covariance P given the recording: A P A' + Q."""
+        """Predict over x+ = A x + b + w: the filter's own state, and P given the recording, to A P A' + Q."""
         initial_power = second_moments_at_start(self.plant)
         move = motion_of_plant(at(self.plant, k), jnp.asarray(u), initial_power)
         covariance = move.matrix @ state.covariance @ move.matrix.T + move.covariance
@@ -100,5 +100,5 @@ class LinearFilterOfRecord(AbstractSizedFilter):
 
     @estimates
     def estimate(self, state: RecordedBelief) -> Estimate:
-        """Return the filter's mean, with the covariance of its error given this recording."""
+        """Return the filter's own mean, with the covariance P that its error has given the data of this recording."""
         return Estimate(state.own.gaussian.mean, state.covariance, self.claim)

@@ -27,7 +27,11 @@ from heliograph.numerics.types import Array
 
 
 class EstimateWithDerivatives(NamedTuple):
-    """An estimate and its derivatives in each of the free numbers; behind a random gain also those before any data."""
+    """The Gaussian of an estimate, and the derivatives of its mean and covariance in each of the p free numbers.
+
+    Behind a random gain also mean and covariance of the state before any data, with their derivatives: the innovation's
+    covariance depends on them. Behind a known gain these two are None.
+    """
 
     gaussian: Gaussian
     slopes: tuple[MomentSlopes, ...]
@@ -63,7 +67,7 @@ def differentiate_start(make: Callable[[Array], Any], x: Array, known_gain: bool
     """
 
     def find_moments(x: Array) -> StateMoments:
-        """Return the initial moments of the filter with the free numbers x."""
+        """Return mean (n,) and covariance (n, n) of the first state, in the filter made with the free numbers x."""
         return find_moments_at_start(make(x))
 
     # Derivative of (mean, covariance) in each free number: a Jacobian-vector product along each axis.
@@ -94,12 +98,12 @@ def differentiate_step(
     """
     z, u = row
     filter, present = make(x), ~jnp.isnan(z)
-    # For each free number the step's matrices and the moments before data, which are the same, and their derivatives.
+    # For each free number: (the step's matrices, moments before data), the same in each pair, and their derivatives.
     pairs = [
         jax.jvp(lambda x, moments: find_model_matrices(make(x), moments, u, k), (x, before.before_data), (axis, slope))
         for axis, slope in zip(np.eye(len(x)), before.slopes_before_data or [None] * len(x), strict=True)
     ]
-    (matrices, moments), _ = pairs[0]
+    (matrices, moments), _ = pairs[0]  # the values: F, b, Q, H, c, R; moments before data after the step
     # Behind a known gain no moment before data matters: those at the start stand for all.
     start = filter.init() if before.before_data is None else LinearBelief(before.gaussian, *before.before_data)
     prior = filter.predict(start._replace(gaussian=before.gaussian), u, k)
@@ -108,7 +112,7 @@ def differentiate_step(
     factored = FactoredStep(prior=prior.gaussian, after=after.gaussian, e=value, S=covariance)
 
     def step(matrices: ModelMatrices, moments: StateMoments) -> StepMoments:
-        """Return what the row makes of the state's moments; `factored` has its values."""
+        """Return the state's moments after the row, and its innovation, with the values of `factored`."""
         return step_by_covariances(matrices, moments, jnp.asarray(z), factored)
 
     of_estimate = StateMoments(before.gaussian.mean, before.gaussian.covariance)

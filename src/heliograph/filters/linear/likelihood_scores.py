@@ -27,14 +27,15 @@ Scores = tuple[Array, Array, Array]  # log-densities, scores, information by hal
 class ScoreRecursion(Recursion):
     """A filter with free numbers x over rows: log-density and score of each row, with the derivatives of its estimate.
 
-    Where it is `informed` also information (2, p, p), by halves of the recording.
+    Free numbers are those of the model that a fit searches, p of them. The score is the derivative of the log-density
+    by them. Where it is `informed` also Fisher's information (2, p, p), by halves of the recording.
 
     Args:
         make: the filter by the free numbers, a `LinearFilter` with `has_score_recursion`.
         x: the free numbers (p,).
         half: number of the first row of the second half.
         known_gain: whether the channel's gain is known.
-        informed: whether there is information.
+        informed: whether the information is computed, too.
     """
 
     make: Callable[[Array], Any] = eqx.field(static=True)
@@ -55,8 +56,10 @@ class ScoreRecursion(Recursion):
         after, (innovation, covariance, *slopes, present, is_invalid) = differentiate_step(
             self.make, self.x, state, row, k
         )
-        size = jnp.abs(row[0]) + jnp.abs(row[0] - innovation)
-        kept = differentiate_log_density(innovation, covariance, (slopes[0], slopes[1]), size, present)
+        z, _ = row
+        innovation_slopes, covariance_slopes = slopes
+        size = jnp.abs(z) + jnp.abs(z - innovation)  # of the terms whose difference is the innovation
+        kept = differentiate_log_density(innovation, covariance, (innovation_slopes, covariance_slopes), size, present)
         # Where the estimate is no number, no likelihood is taken for that of silence.
         density, score, information = (jnp.where(is_invalid, jnp.nan, value) for value in kept)
         if not self.informed:
@@ -69,7 +72,7 @@ class ScoreRecursion(Recursion):
 
         p: free numbers. The information (2, p, p) is summed over each half of the rows.
         """
-        Now = tuple[EstimateWithDerivatives, jax.Array]  # a state, and the information of the rows before
+        Now = tuple[EstimateWithDerivatives, jax.Array]  # the estimate, and the information (2, p, p) so far
 
         def body(now: Now, row: tuple[Array, Array, Array]) -> tuple[Now, tuple[jax.Array, jax.Array]]:
             """Step over one row: add its information, and put out its log-density and score.
@@ -87,10 +90,10 @@ class ScoreRecursion(Recursion):
         return density, score, halves
 
     def sum_long(self, z: np.ndarray, u: np.ndarray) -> Scores | None:
-        """Return the sums over all rows of a long recording, computed in chunks of rows.
+        """Return sums over all rows of a long recording, of log-densities, scores and information, by chunks of rows.
 
-        Returns None if the recording is short or cannot be divided into chunks. `self._start()` is the estimate before
-        the first row, with its derivatives.
+        Chunks run side by side, each from an estimate that has forgotten its start. Returns None if the recording is
+        short or cannot be divided so. `self._start()` is the estimate before the first row, with its derivatives.
         """
         if not is_long(len(z)):
             return None
@@ -101,7 +104,10 @@ class ScoreRecursion(Recursion):
         return summed
 
     def scan_long(self, z: np.ndarray, u: np.ndarray) -> Scores | None:
-        """Return what `scan` returns, computed in chunks of rows; None where `sum_long` returns None."""
+        """Return log-densities, scores row by row and information, as `scan`, of a long recording: in chunks of rows.
+
+        Returns None if the recording is short or cannot be divided into chunks.
+        """
         sums = self.sum_long(z, u)
         if sums is None:
             return None
@@ -117,7 +123,10 @@ class ScoreRecursion(Recursion):
 
 
 def _start_of(recursion: ScoreRecursion) -> EstimateWithDerivatives:
-    """Return the estimate before the first row with its derivatives: compiled body of `ScoreRecursion._start`."""
+    """Return the estimate before the first row, with its derivatives by the free numbers.
+
+    A function of its own, so that it can be compiled: the body of `ScoreRecursion._start`.
+    """
     return differentiate_start(recursion.make, recursion.x, recursion.known_gain)
 
 

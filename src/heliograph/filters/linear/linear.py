@@ -29,10 +29,10 @@ from heliograph.filters.linear.linear_filter_state import (
 from heliograph.filters.linear.precomputed_filter import plan_filter
 from heliograph.filters.smoother_step import SmootherStep, StepTrace, smoother_step_of
 from heliograph.filters.wrappers.accepted_models import accept_limits, accept_sensor_inputs, accept_told_numbers
-from heliograph.model.assumed.assumed_model import believes, with_assumed
+from heliograph.model.assumed.assumed_model import believes
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Claim, Estimate, Innovation, lower_claim_by_noise
-from heliograph.model.fading import memory_matters, uncertain_chain, without_memory
+from heliograph.model.fading import uncertain_chain
 from heliograph.model.markov_jump_models import list_mode_models
 from heliograph.model.over_time import OverTime, at, first, stack_over_time
 from heliograph.model.plant import AbstractPlant, AnyPlant
@@ -85,19 +85,22 @@ class LinearFilter(AbstractSizedFilter):
 
     @predicts
     def predict(self, state: LinearBelief, u: ArrayLike = (), k: Step = 0) -> LinearBelief:
-        """Predict the moments of the estimate, and of the state before any data: A m + B u + E w and A P A' + Q."""
+        """Predict mean and covariance to A m + B u + E w and A P A' + Q, of two laws of the state.
+
+        They are that of the estimate, and that of the state before any data, on which noise of a random gain depends.
+        """
         motion = motion_of_plant(at(self.plant, k), jnp.asarray(u), second_moments_at_start(self.plant))
         return predict_belief(state, motion)
 
     @corrects
     def correct(self, state: LinearBelief, z: ArrayLike, k: Step = 0) -> tuple[LinearBelief, Innovation]:
-        """Correct with the components of z that arrived."""
+        """Correct the estimate with the components of z that arrived; moments before any data stay as they are."""
         sensor, channel, start = at(self.sensor, k), at(self.channel, k), second_moments_at_start(self.plant)
         return correct_linear(state, sensor, channel, self.rule, jnp.asarray(z), start)
 
     @estimates
     def estimate(self, state: LinearBelief) -> Estimate:
-        """Return the mean and covariance of the estimate."""
+        """Return the mean and covariance of the state given the data, those of `state.gaussian`."""
         return Estimate(state.gaussian.mean, state.gaussian.covariance, self.claim)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
@@ -126,25 +129,31 @@ class LinearFilter(AbstractSizedFilter):
 
     @property
     def has_known_gain(self) -> bool:
-        """True if no gain is random: then no covariance needs E[x x'] before data. A traced gain counts as random."""
+        """True if no gain of the channel is random: its covariance is 0 at all steps.
+
+        Then no covariance of the filter needs E[x x'] before any data. A gain that JAX traces counts as random.
+        """
         gain_covariance = stack_over_time(self.channel).gain_covariance
         return not (is_traced(gain_covariance) or np.any(np.asarray(gain_covariance)))
 
     def score_rows(
         self, make: Callable[[Array], "LinearFilter"], x: Float[Array, " p"], half: Array
     ) -> "ScoreRecursion":
-        """Return the recursion that gives the log-likelihood of rows, its derivatives by free numbers and information.
+        """Return the recursion over rows of data that gives a filter's log-likelihood, its gradient and information.
+
+        A fit searches values for p numbers of the model, and needs the gradient by them and Fisher's information. They
+        are those of the filter make(x), not of this one, which only says whether the channel's gain is known.
 
         Args:
             make: makes a filter from the free numbers; its `has_score_recursion` is True.
             x: values (p,) of the free numbers.
-            half: number of the row at which the recording's second half begins. Information is summed by halves.
+            half: number of the row at which the recording's second half begins. Information is summed for each half.
 
         Source: Gupta and Mehra, Computational aspects of maximum likelihood estimation (1974).
         """
         from heliograph.filters.linear.likelihood_scores import ScoreRecursion  # not before a fit needs it
 
-        return ScoreRecursion(make, x, half, self.has_known_gain, informed=True)
+        return ScoreRecursion(make=make, x=x, half=half, known_gain=self.has_known_gain, informed=True)
 
     @property
     def law_at_start(self) -> AbstractPlant:
@@ -166,7 +175,7 @@ class LinearFilter(AbstractSizedFilter):
         return trace_log_likelihood(plain, self, z, u)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
-        """Precompute all covariances and gains."""
+        """Return the filter with gains and covariances of each step computed in advance, for these inputs."""
         return plan_filter(self, inputs)
 
     def given_record(self) -> AbstractFilter:
@@ -274,25 +283,21 @@ def linear_filter(
         if has_bounded_noise(plant, sensor, channel):
             raise fail("noise behind a channel that remembers", "a known law", "bounds of outliers alone")
         filter = _make_filter_behind_memory(plant, sensor, channel)
-        return (
-            replace(filter, claim=lower_claim_by_noise(filter.claim, sensor)) if find_rounded_noises(sensor) else filter
-        )
+        if not find_rounded_noises(sensor):
+            return filter
+        return replace(filter, claim=lower_claim_by_noise(filter.claim, sensor))
     # Independent draws: second moments of the channel are all that matters.
     rule = Polytope() if update is None else update
     described = describe_channel_moments(channel, rule)
     moments = stack_over_time(described)
-    start = first(plant)
+    claim = lower_claim_by_noise(rule.claim(moments.uncertain), plant, sensor, channel)
     return LinearFilter(
         plant=plant,
         sensor=sensor,
         channel=described,
         rule=rule,
         mean_known=not moments.uncertain or has_known_mean(moments),
-        **make_sizes(
-            lower_claim_by_noise(rule.claim(moments.uncertain), plant, sensor, channel),
-            start,
-            first(channel).outputs,
-        ),
+        **make_sizes(claim, first(plant), first(channel).outputs),
     )
 
 
@@ -309,15 +314,20 @@ def _make_filter_behind_memory(plant: AnyPlant, sensor: AnySensor, channel: Chan
     if uncertain_chain(channel):
         return modes.uncertain_modal_filter(plant, sensor, channel)
     terms = modes.independent_terms(channel)
-    return (
-        modes.additive_modal_filter(plant, sensor, terms)
-        if len(terms) > 1
-        else modes.modal_filter(plant, sensor, channel)
-    )
+    if len(terms) > 1:
+        return modes.additive_modal_filter(plant, sensor, terms)
+    return modes.modal_filter(plant, sensor, channel)
 
 
 def _make_jump_system_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> AbstractFilter:
-    """Return the filter of a plant or sensor that has modes; refuse a link that loses or has an uncertain chain."""
+    """Return the best linear filter of a plant or sensor whose matrices depend on a mode, a hidden Markov chain.
+
+    The model at the first step (`first`) stands for all: which kinds of models there are does not vary over time.
+
+    Raises:
+        ValueError: a channel that loses data, or one of uncertain transition probabilities. No best linear filter of
+            these together with modes is known here.
+    """
     if first(channel).erases:
         expected = "a link without losses where plant or sensor has modes (a row that is lost is NaN; imm_filter else)"
         raise fail("channel of a linear filter", expected, "an erasure")
@@ -325,76 +335,3 @@ def _make_jump_system_filter(plant: AnyPlant, sensor: AnySensor, channel: Channe
         expected = "known transitions where plant or sensor has modes"
         raise fail("channel of a linear filter", expected, "a radius of uncertainty")
     return modes.modal_filter(plant, sensor, channel)
-
-
-@believes
-@accept_sensor_inputs
-@accept_told_numbers
-def memoryless_filter(
-    plant: AnyPlant, sensor: AnySensor, channel: Channel, update: Polytope | None = None
-) -> AbstractFilter:
-    """Return the best linear filter for links with independent draws, behind links that may have memory.
-
-    Args:
-        plant: a linear plant, n states.
-        sensor: a linear sensor, m outputs.
-        channel: from the sensor to the filter; its memory is ignored.
-        update: how uncertain probabilities are bounded; `Polytope()` by default.
-
-    Claim: as `linear_filter` for links without memory, lowered to "nominal" where memory matters (`memory_matters`);
-    `true_error` computes the error that results, before any data.
-
-    Raises:
-        ValueError: a plant or sensor that is not linear, parts that do not fit, losses.
-
-    Source: De Koning (1984), for multiplicative noise that is independent over time.
-    """
-    # The channel with its modes drawn anew at each step, and whether its memory correlates mean gains over time.
-    check_linear("memoryless filter", plant, sensor)
-    memoryless_channel, is_memory_relevant = without_memory(channel), memory_matters(channel)
-
-    def make(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> LinearFilter:
-        """Return the filter of a channel without memory.
-
-        Its claim is "nominal" if a memory that matters was ignored. `update` says how uncertain probabilities are
-        bounded.
-        """
-        filter = linear_filter(plant, sensor, channel, update)
-        assert isinstance(filter, LinearFilter)  # a channel without delay or memory has no other
-        return _claim_nominal(filter) if is_memory_relevant else filter
-
-    # A channel that delivers late: the same filter for the system enlarged by past signals.
-    if check_maps("channel", [first(memoryless_channel)])[0].past:
-        return wrappers.build_behind_delays(plant, sensor, memoryless_channel, make)
-    return make(plant, sensor, memoryless_channel)
-
-
-def as_current_filter(
-    plant: AnyPlant, sensor: AnySensor, channel: Channel, update: Polytope | None = None
-) -> LinearFilter:
-    """Return the filter that takes delayed signals as current: the best linear filter if all delays were zero.
-
-    Args:
-        plant: a linear plant, n states.
-        sensor: a linear sensor, m outputs.
-        channel: from the sensor to the filter; its delays and memory are ignored.
-        update: how uncertain probabilities are bounded; `Polytope()` by default.
-
-    Claim: "nominal" where anything can be late or memory matters. `true_error` computes the error that results before
-    any data.
-
-    Raises:
-        ValueError: what `linear_filter` refuses, losses.
-
-    Source: the usual mistake; De Koning (1984), with y_k in place of y_{k-d}.
-    """
-    check_linear("filter that takes delayed signals as current", plant, sensor)
-    without_delay = without_memory(wrappers.deliver_line_as_current(channel))
-    filter = linear_filter(plant, sensor, without_delay, update)
-    assert isinstance(filter, LinearFilter)  # a channel without delay or memory has no other
-    return _claim_nominal(filter) if first(channel).past or memory_matters(channel) else filter
-
-
-def _claim_nominal(filter: LinearFilter) -> LinearFilter:
-    """Return the same filter with the claim "nominal", since it ignores a delay or memory that its link has."""
-    return with_assumed(replace(filter, claim="nominal"), filter.assumed)

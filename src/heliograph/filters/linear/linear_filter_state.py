@@ -57,7 +57,10 @@ class LinearBelief(NamedTuple):
 
 
 class SignalMoments(NamedTuple):
-    """Mean E y (p,) and second moment E[y y'] (p, p) of a signal before any data, and its noise v (p, columns)."""
+    """Moments of a sensor's signal y = C x + v before any data: E y (p,), E[y y'] (p, p), and columns of Cov v.
+
+    A random gain multiplies all of y, so the noise that it makes depends on E[y y'].
+    """
 
     mean: jax.Array
     second: jax.Array
@@ -65,7 +68,11 @@ class SignalMoments(NamedTuple):
 
 
 def prior_belief(start: AbstractPlant) -> LinearBelief:
-    """Return the prior law of x_0 twice: as the estimate, and as the state's moments before data."""
+    """Return the state of a linear filter before the first step, from the plant's law of x_0.
+
+    Mean and covariance of x_0 are in it twice: factored, as the estimate, and as moments before any data, which
+    measurements never change.
+    """
     xp = library(start.initial_mean, start.initial_covariance)
     mean, covariance = xp.asarray(start.initial_mean), xp.asarray(start.initial_covariance)
     estimate = from_covariance(start.initial_mean, start.initial_covariance)
@@ -73,7 +80,11 @@ def prior_belief(start: AbstractPlant) -> LinearBelief:
 
 
 def predict_belief(belief: LinearBelief, step: PlantMotion) -> LinearBelief:
-    """Predict both moments over x+ = A x + b + w: those of the estimate, and those of the state without any data."""
+    """Predict over x+ = A x + b + w the Gaussian of the estimate, and the state's moments before any data.
+
+    Both follow m+ = A m + b and P+ = A P A' + Cov w: the first by factors of P, the second by matrices. `step` has A, b
+    and Cov w.
+    """
     gaussian = predict_affine(belief.gaussian, step.matrix, step.offset, step.noise)
     before_data = MomentsBeforeData(belief.state_mean, belief.state_covariance)
     mean, covariance = before_data.predict(step.matrix, step.offset, step.covariance)
@@ -122,5 +133,5 @@ def _limit_to_finite_squares(mean: jax.Array, covariance: jax.Array) -> tuple[ja
 
 
 def _clip_to(a: jax.Array, largest: float) -> jax.Array:
-    """Clip the entries of a to [-largest, largest]."""
+    """Clip the entries of an array to [-largest, largest]."""
     return lax.max(lax.min(a, lax.full_like(a, largest)), lax.full_like(a, -largest))

@@ -73,7 +73,7 @@ class MemoryFilter(AbstractSizedFilter):
 
     @predicts
     def predict(self, state: MemoryState, u: ArrayLike = (), k: Step = 0) -> MemoryState:
-        """Predict with the linear and the quadratic filter of x - E[x], and propagate E[x]."""
+        """Predict x - E[x] with the linear and the quadratic filter, and E[x], which is known before any data."""
         linear, products = self.linear.predict(state.linear, u, k), self.products.predict(state.products, u, k)
         return MemoryState(linear, products, predict_mean(self.centre, state.mean, k))
 

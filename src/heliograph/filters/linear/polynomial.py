@@ -91,17 +91,20 @@ class PolynomialFilter(AbstractSizedFilter):
 
     @in_float64
     def init(self) -> PyTree:
-        """Return the inner filter's initial state, and E[x_0], which is subtracted before that filter."""
+        """Return the initial state of the inner filter, which estimates x - E[x], and E[x_0]."""
         return CentredState(self.inner.init(), initial_mean(self.centre, len(self.states)))
 
     @predicts
     def predict(self, state: CentredState, u: ArrayLike = (), k: Step = 0) -> CentredState:
-        """Predict with the inner filter of x - E[x], and propagate E[x]."""
+        """Predict x - E[x] by the inner filter, and the mean E[x], which is known before any data."""
         return CentredState(self.inner.predict(state.inner, u, k), predict_mean(self.centre, state.mean, k))
 
     @corrects
     def correct(self, state: CentredState, z: ArrayLike, k: Step = 0) -> tuple[CentredState, Innovation]:
-        """Correct the inner filter with all monomials up to `degree` of z, or of z - E[z] if a mean is subtracted."""
+        """Correct the inner filter, whose measurement is all monomials of z (or z - E[z]) up to `degree`.
+
+        E[z] is subtracted where the inner filter is of x - E[x]. The innovation that is returned is that of z itself.
+        """
         z = subtract_mean(self.centre, z, state.mean, k)
         monomials = evaluate_monomials(z, self.degree)[:-1]  # without the constant
         after, innovation = self.inner.correct(state.inner, monomials, k)
@@ -128,11 +131,11 @@ class PolynomialFilter(AbstractSizedFilter):
         return replace(self.inner.smoother_step(inner_step), offset=jnp.asarray(step.after.mean))
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
-        """Return the same filter with the gains and covariances of the inner filter precomputed."""
+        """Return the same filter with the inner filter's gains and covariances computed in advance."""
         return PolynomialFilter(self.inner.planned(inputs), self.degree, self.endless, self.centre)
 
     def with_past(self, steps: SmootherStep) -> AbstractFilter:
-        """Return the filter with the smoother steps of its inner filter."""
+        """Return the same filter, made able to smooth: its inner filter gets the smoother's gains of each step."""
         return PolynomialFilter(self.inner.with_past(steps), self.degree, self.endless, self.centre)
 
 
@@ -164,12 +167,20 @@ def subtract_mean(centre: UnconditionalMean | None, z: ArrayLike, mean: Array, k
 
 
 def add_mean(estimate: Estimate, mean: Float[Array, " n"]) -> Estimate:
-    """Add the mean of the state to an estimate of x - E[x]."""
+    """Return the estimate of x from one of x - E[x]: the mean E[x] (n,) is added, the covariance stays."""
     return Estimate(estimate.mean + mean, estimate.covariance, estimate.claim)
 
 
 def select_degree_one(innovation: Innovation, z: Float[Array, " m"], degree: int) -> Innovation:
-    """Return the innovation of z itself, selected from the innovation of all monomials of (z, 1) of this degree."""
+    """Return the innovation of z itself, selected from the innovation of all its monomials up to `degree`.
+
+    Monomials up to `degree` of z (m,) are those of exactly that degree of (z, 1), each with m + 1 exponents.
+
+    Args:
+        innovation: of the vector of monomials.
+        z: the measurement, whose size gives the rounding of the differences.
+        degree: of the monomials.
+    """
     # z_i is the monomial of exponent 1 in z_i and degree - 1 in the constant, the last factor.
     m, position_of = len(z), position(len(z) + 1, degree)
     exponents = [(*row, degree - 1) for row in np.eye(m, dtype=int).tolist()]
@@ -217,9 +228,17 @@ def polynomial_filter(
 def lift_about_mean(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: int, horizon: int
 ) -> tuple[UnconditionalMean | None, LinearSystem]:
-    """Lift the model to monomials up to `degree`, about its mean where the gain is known.
+    """Return the linear system of all powers (monomials) of the state up to `degree`, and the mean that they are about.
 
-    Return the unconditional mean that is subtracted, or None behind a random gain, and the lifted system.
+    Powers of a linear system's state follow a linear system of their own. Where the channel's gain is known they are
+    powers of x - E[x], so that a large mean costs no digits; the mean is None behind a random gain, or where it is 0.
+
+    Args:
+        plant: a linear plant.
+        sensor: a linear sensor.
+        channel: from the sensor to the filter.
+        degree: of the powers.
+        horizon: number of steps.
     """
     check_model(plant, sensor, channel)
     centre = find_unconditional_mean(plant, sensor, channel)
@@ -230,7 +249,9 @@ def lift_about_mean(
 def _is_steady(plant: AnyPlant, sensor: AnySensor, channel: Channel, system: LinearSystem) -> bool:
     """Return whether the matrices of a time-invariant model have reached a steady state, up to rounding.
 
-    The last two steps of each matrix in `system.steps` are compared. A model that varies over time is never steady.
+    Then the filter may run beyond the horizon. `system.steps` holds an array (horizon, ...) of each matrix, of which
+    the last two steps are compared. A model that varies over time is never steady (`steps_covered` is then the number
+    of its steps, else None).
     """
     if steps_covered((plant, sensor, channel)) is not None or system.horizon < 2:
         return False

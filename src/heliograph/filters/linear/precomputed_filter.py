@@ -35,19 +35,19 @@ class LinearStep(NamedTuple):
     innovation: jax.Array
 
     def predict(self, mean: Float[Array, " N"]) -> Float[jax.Array, " N"]:
-        """Return m- = F m + f."""
+        """Return the predicted mean m- = F m + f."""
         return jnp.asarray(self.transition @ mean + self.drift)
 
     def expect(self, mean: Float[Array, " N"]) -> Float[jax.Array, " m"]:
-        """Predict the measurement, C m- + c, from the predicted mean m-."""
+        """Return the expected measurement C m- + c, from the predicted mean m-."""
         return jnp.asarray(self.output @ mean + self.offset)
 
     def correct(self, mean: Float[Array, " N"], innovation: Float[jax.Array, " m"]) -> Float[jax.Array, " N"]:
-        """Return m = m- + K e."""
+        """Return the corrected mean m = m- + K e, from the predicted mean m- and the innovation e."""
         return jnp.asarray(mean + self.gain @ innovation)
 
     def error_transition(self) -> Float[jax.Array, "*node N N"]:
-        """Return I - K C, which maps the predicted mean, and its error, to the corrected one."""
+        """Return I - K C (N, N), which takes the error of the predicted mean to that of the corrected one."""
         return jnp.asarray(jnp.eye(self.gain.shape[-2]) - self.gain @ self.output)
 
 
@@ -87,7 +87,7 @@ class PlannedFilter(AbstractSizedFilter):
 
     @in_float64
     def init(self) -> PlannedMean:
-        """Return the initial mean."""
+        """Return the initial mean, with the index 0 of its covariance."""
         return PlannedMean(jnp.asarray(self.start), jnp.asarray(0))
 
     @predicts
@@ -110,11 +110,14 @@ class PlannedFilter(AbstractSizedFilter):
 
     @estimates
     def estimate(self, state: PlannedMean) -> Estimate:
-        """Return the mean of the state, with the planned covariance."""
+        """Return the state's mean, with the covariance that was computed in advance for this stage of the run."""
         return self._estimate(state.mean, state.stage)
 
     def after_step(self, state: PlannedMean, k: Step) -> Estimate:
-        """Return the mean of the state, with the planned covariance of step k, common to all runs."""
+        """Return the state's mean, with the covariance computed in advance for step k.
+
+        As k is the same of all runs that are stepped together, they share one covariance.
+        """
         return self._estimate(state.mean, 2 * k + 2)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
@@ -224,7 +227,7 @@ def record_step_matrices(
     zero_mean = jnp.zeros_like(gaussian_of(state).mean)
 
     def predict(mean: jax.Array) -> tuple[jax.Array, PyTree]:
-        """Return the predicted mean, and the predicted state."""
+        """Return the predicted mean as a function of the mean before, to be differentiated, and the predicted state."""
         prior = filter.predict(_with_mean(state, mean), u, k)
         return jnp.asarray(gaussian_of(prior).mean), prior
 
@@ -243,7 +246,7 @@ def record_step_matrices(
 
 
 def _with_mean(state: PyTree, mean: jax.Array) -> PyTree:
-    """Return a filter's state with another mean."""
+    """Return a filter's state with another mean (N,): the state is a Gaussian, or holds one."""
     return with_gaussian(state, gaussian_of(state)._replace(mean=mean))
 
 
@@ -265,7 +268,10 @@ def _differentiate_correction(
     """Differentiate the filter's correction of the state `prior`, with the mean `mean` (N,), by z (m,) at step k."""
 
     def correct(mean: jax.Array, z: jax.Array) -> tuple[tuple[jax.Array, jax.Array], PyTree]:
-        """Return corrected mean and innovation, and the objects that hold them."""
+        """Return the corrected mean and the innovation e, as functions of the prior mean and z, to be differentiated.
+
+        The second result, not differentiated, is the corrected state and the whole innovation.
+        """
         after, innovation = filter.correct(_with_mean(prior, mean), z, k)
         return (jnp.asarray(gaussian_of(after).mean), jnp.asarray(innovation.value)), (after, innovation)
 
@@ -327,6 +333,9 @@ def linearise_step(filter: AbstractFilter, state: PyTree, z: jax.Array, u: jax.A
 
 
 def _project_covariance(state: PyTree, projection: Array | None) -> jax.Array:
-    """Return the covariance of the plant's state, by the projection if there is one."""
+    """Return the covariance of the plant's state x = projection m: projection P projection', (n, n).
+
+    `state` is a filter's state with mean m and covariance P; without a projection m is x itself.
+    """
     covariance = jnp.asarray(gaussian_of(state).covariance)
     return covariance if projection is None else jnp.asarray(projection) @ covariance @ jnp.asarray(projection).T

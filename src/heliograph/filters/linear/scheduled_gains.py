@@ -141,7 +141,7 @@ class ScheduledFilter(AbstractSizedFilter):
         return self._estimate(state, state.stage)
 
     def after_step(self, state: ScheduleState, k: Step) -> Estimate:
-        """Return the estimate after step k, with the covariance of that step, common to all runs."""
+        """Return the estimate after step k, with the covariance saved for step k: one for all runs stepped together."""
         return self._estimate(state, 2 * k + 2)
 
     def _estimate(self, state: ScheduleState, stage: Step) -> Estimate:
@@ -183,7 +183,11 @@ class LinearSystemFilter(AbstractSizedFilter):
     projection: np.ndarray
 
     def __init__(self, system: LinearSystem, claim: Claim = "exact", states: Sequence[str] | None = None):
-        """Keep the steps of a linear system, factors of its noises, its initial moments and its projection."""
+        """Keep the matrices of each step, factors of the noises, the law of the first state, and the projection.
+
+        The system is y+ = A y + a + w, z = C y + c + v; the plant's states are `projection` y. Of its noises factors
+        are computed, to which the rounding of state and measurement is added.
+        """
         instance("system", system, LinearSystem, "a LinearSystem")
         self.steps, self.noises = OverTime(system.steps), OverTime(_factor_noises(system))
         self.mean, self.covariance, self.projection = system.mean, system.covariance, system.projection
@@ -193,20 +197,20 @@ class LinearSystemFilter(AbstractSizedFilter):
 
     @in_float64
     def init(self) -> Gaussian:
-        """Return the law of the system's state before the first step."""
+        """Return the Gaussian of the system's state y before the first step."""
         return from_covariance(self.mean, self.covariance)
 
     @predicts
     def predict(self, state: Gaussian, u: ArrayLike = (), k: Step = 0) -> Gaussian:
-        """Return A y + a and A P A' + Cov(w)."""
-        s: Steps = at(self.steps, k)
-        return predict_affine(state, s.transition, s.drift, at(self.noises, k).process)
+        """Predict the system's state over y+ = A y + a + w: mean A m + a, covariance A P A' + Cov w."""
+        step: Steps = at(self.steps, k)
+        return predict_affine(state, step.transition, step.drift, at(self.noises, k).process)
 
     @corrects
     def correct(self, state: Gaussian, z: ArrayLike, k: Step = 0) -> tuple[Gaussian, Innovation]:
-        """Correct with the components of z that arrived.
+        """Condition the system's state y = m + L xi on the components of z = C y + c + v that arrived.
 
-        z = output x + offset + noise. `slopes` are those of z in xi, for x = mean + root xi.
+        `slopes` are C L, those of z in xi.
         """
         step: Steps = at(self.steps, k)
         z, noise = jnp.asarray(z), at(self.noises, k).measurement
@@ -230,12 +234,15 @@ class LinearSystemFilter(AbstractSizedFilter):
         return smoother_step_of(step, (slopes, noise), self.claim, projection=self.projection)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
-        """Precompute all covariances and gains."""
+        """Return the filter with gains and covariances of each step computed in advance, for complete data."""
         return plan_filter(self, inputs, self.projection)
 
 
 class SystemNoises(NamedTuple):
-    """Factors of both noises of a step, with the rounding of the state and of the measurement."""
+    """Factors of Cov w (`process`) and Cov v (`measurement`) of a step y+ = A y + a + w, z = C y + c + v.
+
+    The covariance of the rounding of y is added to the first, that of z to the second.
+    """
 
     process: WeightedColumns
     measurement: WeightedColumns
@@ -262,9 +269,10 @@ def _factor_noises(system: LinearSystem) -> SystemNoises:
 
 @compile_in_float64
 def _factor_with_rounding(noise: WeightedColumns, second_moments: Array, rounding_errors: Array) -> WeightedColumns:
-    """Return the factors of each step's noise, joined with the rounding of numbers of these second moments.
+    """Return factors L diag(d) L' of each step's noise covariance, to which two diagonal covariances are added.
 
-    `rounding_errors` are those of the noise's variances. Shapes: noise (steps, n, columns), the others (steps, n).
+    They are the rounding of numbers with these second moments, and `rounding_errors`, that of the noise's variances
+    themselves. Shapes: noise (steps, n, columns), the others (steps, n).
     """
 
     def factor_step(noise: WeightedColumns, second_moments: jax.Array, rounding_errors: jax.Array) -> WeightedColumns:

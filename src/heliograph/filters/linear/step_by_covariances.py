@@ -89,7 +89,10 @@ class StateMoments(NamedTuple):
 
 
 def find_moments_at_start(filter: Any) -> StateMoments:
-    """Return the mean and covariance of the state before the first step of a linear filter."""
+    """Return mean (n,) and covariance (n, n) of the state before the first step of a linear filter.
+
+    They are the filter's own, or the plant's; `filter.law_at_start` is whichever holds them.
+    """
     start = filter.law_at_start
     return StateMoments(jnp.asarray(start.initial_mean), jnp.asarray(start.initial_covariance))
 

@@ -27,7 +27,9 @@ Carried = tuple[PyTree, StateMoments, MomentsBeforeData | None]
 def trace_log_likelihood(
     plain: Callable[..., jax.Array], filter: Any, z: Float[Array, "steps m"], u: Float[Array, "steps inputs"]
 ) -> jax.Array:
-    """Return the log-likelihood of rows by the filter's factors, with derivatives by its covariances.
+    """Return the log-likelihood of rows: its value by factored covariances, its derivatives by the covariances.
+
+    Values by factors L diag(d) L' are more exact; derivatives of the covariance matrices themselves are cheaper.
 
     Args:
         plain: the log-likelihood by the factors, a function of filter, z and u.
@@ -55,8 +57,9 @@ def _sum_by_covariances(filter: Any, z: Float[Array, "steps m"], u: Float[Array,
     def step(before: Carried, row: tuple[jax.Array, ...]) -> tuple[Carried, jax.Array]:
         """Filter a row (number, measurement, input) twice: by factors, and by covariances for the derivatives.
 
-        The values are those by factors, which are exact but are not differentiated. Return what is carried to the next
-        row, and the log-likelihood of this one.
+        The values are those by factors, which are more exact but are not differentiated; the same numbers by
+        covariances give them their derivatives. Returns what is carried to the next row (`Carried`), and the
+        log-likelihood of this one.
         """
         (state, moments, before_data), (k, z, u) = before, row
         prior = constant.predict(state, _hold_constant(u), k)
@@ -74,9 +77,13 @@ def _sum_by_covariances(filter: Any, z: Float[Array, "steps m"], u: Float[Array,
     start = jax.tree.map(jnp.asarray, constant.init())
     before_data = None if filter.has_known_gain else MomentsBeforeData(*moments)
     rows = jnp.arange(len(z)), jnp.asarray(z), jnp.asarray(u)
-    return jnp.sum(jax.lax.scan(step, (start, moments, before_data), rows)[1])
+    _, log_densities = jax.lax.scan(step, (start, moments, before_data), rows)
+    return jnp.sum(log_densities)
 
 
 def _hold_constant(tree: PyTree) -> PyTree:
-    """Return the same numbers, of which the traced ones are not differentiated, and known ones stay known."""
+    """Return the same tree of numbers as constants: JAX does not differentiate by those that are traced.
+
+    Numbers that are known while tracing are left as they are, so that they stay known.
+    """
     return jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf) if is_traced(leaf) else leaf, tree)

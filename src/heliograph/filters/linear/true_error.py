@@ -37,7 +37,7 @@ class TrueError:
 
     @property
     def ratio(self) -> Float[np.ndarray, "time n"]:
-        """True over claimed variance of each state."""
+        """True over claimed variance of each state after each correction: 1 where the claim is right."""
         return np.asarray(np.diagonal(self.true, axis1=1, axis2=2) / np.diagonal(self.claimed, axis1=1, axis2=2))
 
 
@@ -131,17 +131,19 @@ def _predict_joint_moments(
         transition: transition matrix of the modes (M, M).
     """
     n, size = len(plant.states), moments.shape[-1]
+    x, one, s = slice(0, n), n, slice(n + 1, None)  # where r = (x, 1, s) has its three parts
     inputs = jnp.asarray(u)
-    # r+ = [A b 0; 0 1 0; 0 f F] r + (w, 0, 0), with the matrix T and the noise N = diag(Q, 0, 0).
-    matrix, noise = np.zeros((2, size, size))
-    matrix[:n, :n], matrix[n, n] = plant.transition_matrix(inputs), 1.0
-    matrix[:n, n] = plant.shift(inputs)
-    matrix[n + 1 :, n + 1 :], matrix[n + 1 :, n] = step.transition, step.drift
-    noise[:n, :n] = plant.noise_covariance(inputs)
+    # r+ = T r + (w, 0, 0) with T = [A b 0; 0 1 0; 0 f F], and N = diag(Q, 0, 0).
+    T, N = np.zeros((2, size, size))
+    T[x, x], T[x, one] = plant.transition_matrix(inputs), plant.shift(inputs)
+    T[one, one] = 1.0
+    T[s, s], T[s, one] = step.transition, step.drift
+    N[x, x] = plant.noise_covariance(inputs)
     # Modes move first: moments after the move of the chain.
     before = mix_moments_of_modes(transition, moments)
-    # T E[r r' 1{mode}] T' + P(mode) N. Here `before[:, n, n]` = E[1 1{mode}] is the probability of each mode.
-    return np.asarray(propagate_by_mode(matrix, before, before[:, n, n, None, None] * noise))
+    # T E[r r' 1{mode}] T' + P(mode) N, with P(mode) = E[1 1 1{mode}].
+    probability = before[:, one, one, None, None]
+    return np.asarray(propagate_by_mode(T, before, probability * N))
 
 
 def _correct_moments(moments: np.ndarray, sensor: LinearSensor, channel: ChannelByMode, step: LinearStep) -> np.ndarray:
@@ -162,22 +164,23 @@ def _correct_moments(moments: np.ndarray, sensor: LinearSensor, channel: Channel
     """
     # K, E[(G, n)] by mode, D, and the covariance of (v, 0).
     p, n = sensor.matrix.shape
+    x_and_one, one, s = slice(0, n + 1), n, slice(n + 1, None)  # where r = (x, 1, s) has its parts
     gain, mean = np.asarray(step.gain), np.asarray(channel.mean)
-    probability = moments[:, n, n, None, None]  # E[1 1{mode}]
+    probability = moments[:, one, one, None, None]  # P(mode) = E[1 1 1{mode}]
     D, noise = np.zeros((p + 1, n + 1)), np.zeros((p + 1, p + 1))
     D[:p, :n], D[:p, n], D[p, n] = sensor.matrix, sensor.noise.mean, 1.0
     noise[:p, :p] = sensor.noise.covariance
     # r+ = A_j r + zero-mean terms in s, with x and 1 unchanged: rows of s get K E[(G, n)] D - (0, K c) and I - K C.
     A = np.zeros_like(moments) + np.eye(moments.shape[-1])
-    A[:, n + 1 :, : n + 1] += gain @ mean @ D
-    A[:, n + 1 :, n + 1 :] -= gain @ step.output
-    A[:, n + 1 :, n] -= gain @ step.offset
+    A[:, s, x_and_one] += gain @ mean @ D
+    A[:, s, s] -= gain @ step.output
+    A[:, s, one] -= gain @ step.offset
     # Second moment of the zero-mean terms without K, an m x m matrix for each mode j: entry (i, l) of the first is
     # sum_ab Cov[(G, n)_ia, (G, n)_lb] E[(y, 1)_a (y, 1)_b 1{mode j}].
-    signal_moments = propagate_by_mode(D, moments[:, : n + 1, : n + 1], probability * noise)
+    signal_moments = propagate_by_mode(D, moments[:, x_and_one, x_and_one], probability * noise)
     by_channel = np.einsum("jilab,jab->jil", np.asarray(channel.covariance), signal_moments)
     by_sensor = probability * propagate_by_mode(mean, noise, 0.0)
     # A_j E[r r' 1{mode j}] A_j', and K (...) K' in the block of s.
     after: np.ndarray = propagate_by_mode(A, moments, 0.0)
-    after[:, n + 1 :, n + 1 :] += propagate_by_mode(gain, by_channel + by_sensor, 0.0)
+    after[:, s, s] += propagate_by_mode(gain, by_channel + by_sensor, 0.0)
     return after

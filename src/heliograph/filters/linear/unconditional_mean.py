@@ -33,7 +33,8 @@ class UnconditionalMean(Module):
 def find_unconditional_mean(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> UnconditionalMean | None:
     """Return E[x_0], A_k, b_k and G_k C_k of a linear model, from which E x_k and E z_k follow before any data.
 
-    None where E x is zero throughout, or a gain is random.
+    A filter of powers of x subtracts these means, so that its moments lose no digits to a large mean. None where E x is
+    zero throughout, so that there is nothing to subtract, or a gain is random.
     """
     plants, sensors, channels = unstack(plant), unstack(sensor), unstack(channel)
     if not all(c.has_known_gain for c in channels):
@@ -44,7 +45,7 @@ def find_unconditional_mean(plant: AnyPlant, sensor: AnySensor, channel: Channel
         return None
     count = max(len(sensors), len(channels))
     pairs = zip(_repeat(sensors, count), _repeat(channels, count), strict=False)
-    # E z = E[G] C E x, without the channel's offset: its last row and column are left out.
+    # E z = E[G] C E x. `moments(1).mean` is E[[G, n], [0, 1]] (m + 1, p + 1), of which [:-1, :-1] is E[G].
     received = [np.asarray(c.moments(1).mean[:-1, :-1]) @ _matrix_of(s) for s, c in pairs]
     return UnconditionalMean(
         start=start,
@@ -61,7 +62,10 @@ def centre_plant(plant: AnyPlant) -> AnyPlant:
 
 
 def _centre_plant(plant: AbstractPlant) -> LinearPlant:
-    """Return the plant of x - E x, which has the same matrices but zero means of noise and start, and no offset."""
+    """Return the plant of x - E x: the same matrices, but noise and first state with the mean 0.
+
+    A law that simulations draw the first state from (`deviation`) is kept, about its mean; else it is Gaussian.
+    """
     assert isinstance(plant, LinearPlant) and isinstance(plant.noise, AbstractNoise)
     law = about_mean(plant.deviation) if plant.deviation is not None else Gaussian(plant.initial_covariance)
     return LinearPlant(
@@ -82,7 +86,7 @@ def _matrix_of(model: AbstractPlant | AbstractSensor) -> np.ndarray:
 
 
 def _repeat(items: list[T], count: int) -> list[T]:
-    """Return `count` items: a single one is that of all steps."""
+    """Return the items of `count` steps: a single item, of a model that does not vary over time, is repeated."""
     return items * count if len(items) == 1 else items
 
 

@@ -158,16 +158,19 @@ class AdditiveModalFilter(AbstractModalFilter):
         return smoother_step_of(step, slopes_and_noise, self.claim, projection=self._projection_to_state())
 
     def _projection_to_state(self) -> Float[np.ndarray, "n N"]:
-        """Return the matrix (n, N) that maps zeta, whose first block is (x, 1), to x."""
+        """Return the matrix (n, N) that maps zeta, whose first block is (x, 1), to x: [I, 0, 0, ...]."""
         return np.eye(len(self.states), (len(self.states) + 1) * self._function_count)
 
     @property
     def _function_count(self) -> int:
-        """Number of functions of the modes, 1 + sum_i (m_i - 1)."""
+        """Number of functions phi of the modes: the constant 1, and one for each mode of a link i but its first."""
         return 1 + sum(len(law) - 1 for law in self.initial)
 
     def _embed_first_block(self, first: jax.Array) -> jax.Array:
-        """Embed a vector as the first block of zeta, with zeros for the blocks of the other functions."""
+        """Return a vector as the first block of zeta, with zeros in all others.
+
+        zeta has a block of length n + 1 for each function of the modes; the first function is 1.
+        """
         return jnp.pad(first, (0, (self._function_count - 1) * len(first)))
 
     def _mean_from_centre(self, centre: jax.Array) -> jax.Array:
@@ -178,7 +181,10 @@ class AdditiveModalFilter(AbstractModalFilter):
         return self._embed_first_block(jnp.append(centre, 0.0))
 
     def _transition_matrices(self, state: AdditiveBelief, k: Step) -> Laws:
-        """Return the transition matrix of each term's chain; the identity before the first prediction."""
+        """Return the transition matrix of the modes of each link in the sum, to step k.
+
+        Before the first prediction modes keep their initial law, so that the matrices are identities.
+        """
         chains = [jnp.asarray(term.transition) for term in at(self.terms, k)]
         return tuple(jnp.where(state.moved, chain, jnp.eye(len(chain))) for chain in chains)
 
@@ -277,7 +283,10 @@ def _function_transition(transitions: Laws) -> jax.Array:
 
 
 def _indicator_covariance(law: jax.Array) -> jax.Array:
-    """Return the covariance of the indicators of all modes but the first, diag(p) - p p'."""
+    """Return Cov of the indicators 1{mode = j} of all modes but the first (M - 1, M - 1): diag(p) - p p'.
+
+    p are their probabilities; `law` (M,) has those of all modes.
+    """
     return jnp.diag(law[1:]) - jnp.outer(law[1:], law[1:])
 
 
@@ -305,7 +314,10 @@ def _block_diagonal_columns(first_factor: np.ndarray, covariances: Sequence[jax.
 
 
 def additive_modal_filter(plant: AnyPlant, sensor: AnySensor, terms: Sequence[Channel]) -> AdditiveModalFilter:
-    """Return the best linear filter behind a sum of links (`terms`) that share no memory; each term has all outputs."""
+    """Return the best linear filter behind a channel that is a sum of links, z = sum of all terms' z.
+
+    The terms share no memory, so that their modes are independent. Each term has all outputs of the channel.
+    """
     laws, models = zip(*(channels_by_mode(term) for term in terms), strict=True)
     claim: Claim = "exact" if all(claim_of_modes(term) == "exact" for term in terms) else "nominal"
     sizes = make_sizes(claim, first(plant), first(terms[0]).outputs)
@@ -313,7 +325,10 @@ def additive_modal_filter(plant: AnyPlant, sensor: AnySensor, terms: Sequence[Ch
 
 
 def independent_terms(channel: Channel) -> list[Channel]:
-    """Return the terms of a sum of links that share no memory, or the channel itself if it cannot be split."""
+    """Return the terms of a channel z = z_1 + z_2 + ... whose links share no memory, each as a channel of its own.
+
+    Their modes are then independent, which a filter can use. A channel that cannot be split so is its own only term.
+    """
     terms_by_step = [split_terms_without_common_memory(step) for step in unstack(channel)]
     # Steps that split differently have no terms in common.
     if len({len(terms) for terms in terms_by_step}) > 1 or len(terms_by_step[0]) == 1:

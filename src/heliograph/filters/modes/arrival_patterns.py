@@ -118,11 +118,11 @@ class HasPatterns(Protocol):
 
     @property
     def present(self) -> Bool[Array, "A m"]:
-        """Which components of z arrive in each pattern."""
+        """Flags (A, m): which components of z arrive in each of A patterns."""
 
     @property
     def chance(self) -> Float[Array, "M A"]:
-        """Chance of each pattern by mode."""
+        """Probabilities (M, A) of each pattern of arrivals in each mode."""
 
 
 def pattern_of(channel: HasPatterns, arrived: Bool[Array, " m"]) -> jax.Array:

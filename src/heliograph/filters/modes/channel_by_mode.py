@@ -45,23 +45,31 @@ def channels_by_mode(channel: Channel, beside: PyTree = ()) -> tuple[Float[Array
 
 
 def channel_by_mode(step: JointModes, step_before: JointModes) -> ChannelByMode:
-    """Return the channel's moments in each mode of one step, with the transition of the modes to it.
+    """Return the first two moments of (G, n) in z = G y + n, given each mode of the channel's links at one step.
+
+    A joint mode is a combination of the modes of all links; the joint modes are one Markov chain. Given the mode, G and
+    n are random still. Filters of the mode need these moments mode by mode, and the transition to this step.
 
     Args:
-        step: joint modes of the links, and in each a random map z = G y + n.
-        step_before: those of the step before, which hold the transition to this step, and the largest error of its
-            entries (`radius`).
+        step: the joint modes; `maps` has for each the random map (G, n) without memory.
+        step_before: those of the step before. It holds the transition matrix from that step to this one, and `radius`,
+            the largest error of each of its entries where the probabilities are uncertain.
     """
-    # E[(G, n)] by mode, and Cov(G, n) under the nominal law as the gains' covariance and columns of the noise.
-    mean = stack_parts([affine.moments(1).mean[:-1] for affine in step.maps])
-    gains, noises = zip(*(split_off_noise(nominal_covariance(affine).center) for affine in step.maps), strict=True)
+    # E[(G, n)] (m, p + 1): all rows but the last of the mean of [[G, n], [0, 1]].
+    means = [affine.moments(1).mean[:-1] for affine in step.maps]
+    # Cov(G, n) by the probabilities as given (nominal), split in the covariances of G and columns of Cov n.
+    gains, noises = [], []
+    for affine in step.maps:
+        covariance_of_gain, columns_of_noise = split_off_noise(nominal_covariance(affine).center)
+        gains.append(covariance_of_gain)
+        noises.append(columns_of_noise)
     noise = WeightedColumns(
         stack_parts([noise.matrix for noise in noises]), stack_parts([noise.weights for noise in noises])
     )
     return ChannelByMode(
         transition=step_before.transition,
         radius=step_before.radius,
-        mean=mean,
+        mean=stack_parts(means),
         gain_covariance=stack_parts(gains),
         noise=noise,
     )

@@ -28,10 +28,11 @@ def correct_in_every_mode(
     z: jax.Array,
     angles: Angles = (),
 ) -> tuple[Gaussian, jax.Array, Innovation]:
-    """Return the posteriors of several Gaussians, each corrected in its mode, their weights, the mixture's innovation.
+    """Correct several Gaussians of x, each in its own mode of the link, and weigh them by their likelihoods.
 
-    The weight becomes proportional to weight P(which components arrive | mode) N(z; ...). The innovation's likelihood
-    is that of z given which components arrive.
+    Gaussian c has the weight w_c before z, and z has the density N(z; z_c, S_c) under it, by the gain and noise of its
+    mode. Its weight becomes w_c P(which components arrive | its mode) N(z; z_c, S_c), divided by the sum of all. A
+    Gaussian whose mode cannot produce such a z stays as it was.
 
     Args:
         signal: moments of the sensor's signal y under each Gaussian of the state x (K, ...).
@@ -40,6 +41,10 @@ def correct_in_every_mode(
         weight: probability of each Gaussian and its mode (K,).
         z: measurement (m,), NaN for what did not arrive.
         angles: components of z that are angles.
+
+    Returns:
+        The posteriors (K, ...), their weights (K,), and the innovation of the mixture, with the likelihood of z given
+        which components arrive.
     """
     # Channel moments by mode, given which components arrived.
     pattern = pattern_of(channel, ~jnp.isnan(z)) if len(channel.present) > 1 else 0
@@ -62,12 +67,18 @@ def correct_in_every_mode(
 def _correct_in_mode(
     signal: Signal, mean: jax.Array, gain_covariance: jax.Array, link: WeightedColumns, z: jax.Array, angles: Angles
 ) -> tuple[Gaussian, Innovation]:
-    """Correct the prior of a signal y with z = G y + n in one mode of the channel.
+    """Correct the Gaussian of x with z = G y + n, whose random gain G and noise n have the law of one mode.
 
-    In this mode `mean` is E[(G, n)], `gain_covariance` is Cov G, `link` has columns of Cov n; `angles` are those of z.
+    Args:
+        signal: moments of the sensor's signal y, and the prior of x.
+        mean: E[(G, n)] (m, p + 1), the mean noise as last column.
+        gain_covariance: covariances of the entries of G (m, m, p + 1, p + 1).
+        link: columns of Cov n.
+        z: measurement (m,), NaN for what did not arrive.
+        angles: components of z that are angles.
     """
-    gain = mean[:, :-1]
-    expected = gain @ signal.mean + mean[:, -1]
+    gain, offset = mean[:, :-1], mean[:, -1]  # E G and E n
+    expected = gain @ signal.mean + offset
     z = wrap_near(z, expected, angles)
     slopes, noise = gain @ signal.slopes, noise_behind_gain(signal, gain, gain_covariance, link)
     return condition_on_measurement(signal.prior, slopes, noise, z, expected)

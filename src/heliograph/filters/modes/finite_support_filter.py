@@ -108,7 +108,7 @@ class MixtureFilter(AbstractSizedFilter):
     observed_angles: Angles = eqx.field(static=True)
 
     def angles_used(self) -> FilterAngles:
-        """Return the angles of its plant, and those that its channel delivers."""
+        """Return the indices of states that are angles, and of components of z that are."""
         return FilterAngles(first(self.plant).angles, self.observed_angles)
 
     @property
@@ -143,8 +143,9 @@ class MixtureFilter(AbstractSizedFilter):
         a Gaussian noise. The state holds the law of the links' modes and one Gaussian of x, which after the correction
         has the mean and covariance of the mixture of all updates (moment matching).
         """
-        c, z, x = at(self.components, k), jnp.asarray(z), state.gaussian
-        prior = state.law[c.mode] * jnp.asarray(c.weight)  # P(combination) = P(mode) P(combination | mode)
+        combinations, z, x = at(self.components, k), jnp.asarray(z), state.gaussian
+        # P(combination) = P(mode) P(combination | mode).
+        prior = state.law[combinations.mode] * jnp.asarray(combinations.weight)
         size = square_root(second_moments_at_start(self.plant))  # of the states, for the rounding of gain @ x
         present = ~jnp.isnan(z)
 
@@ -162,7 +163,7 @@ class MixtureFilter(AbstractSizedFilter):
             certain = jnp.sum(present & innovations.determined)
             return _CombinationUpdate(posterior, log_likelihood, certain, value=value, covariance=covariance)
 
-        updates = jax.vmap(condition_on_combination)(c.gain, c.offset, c.noise)
+        updates = jax.vmap(condition_on_combination)(combinations.gain, combinations.offset, combinations.noise)
         # Posterior weights prior * likelihood. A combination that determines more of z exactly has an infinitely larger
         # density, so that only those with the most count. `excluded`: none can produce z, and the state stays.
         log_likelihood = drop_below_point_mass(updates.log_likelihood, updates.certain)
@@ -172,13 +173,13 @@ class MixtureFilter(AbstractSizedFilter):
         covariance = jnp.where(present[:, None] & present, updates.covariance, jnp.nan)
         innovation = mixed_innovation(prior, value, covariance, density)
         # The probability of a mode is that of all its combinations.
-        law = weight @ (c.mode[:, None] == jnp.arange(len(state.law)))
+        law = weight @ (combinations.mode[:, None] == jnp.arange(len(state.law)))
         updated = MixtureBelief(gaussian=merge_mixture(updates.posterior, weight), law=law, moved=state.moved)
         return jax.tree.map(lambda old, new: jnp.where(excluded, old, new), state, updated), innovation
 
     @estimates
     def estimate(self, state: MixtureBelief) -> Estimate:
-        """Return the mean and covariance of the belief, angles between -pi and pi."""
+        """Return the mean and covariance of x given the data, with angles between -pi and pi."""
         x = state.gaussian
         return Estimate(wrap_angles(x.mean, first(self.plant).angles), x.covariance, self.claim)
 
@@ -257,7 +258,11 @@ def mixture_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, resolut
 
 
 def _joint_modes_of(channel: AbstractRandomAffine) -> JointModes:
-    """Combine a channel's memories in one chain; raise ValueError for a gain that drifts."""
+    """Return the modes of all links with memory as one Markov chain, with the links' law in each joint mode.
+
+    Raises:
+        ValueError: a gain that drifts continuously, which has no finite number of values.
+    """
     if any(memory.drifts for memory in memories(channel).values()):
         raise fail("mixture filter", "gains of finitely many values", "one that drifts")
     return joint_modes(channel)

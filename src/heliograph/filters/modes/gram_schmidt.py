@@ -53,11 +53,17 @@ def spoil_where_known(
     """
     if not writes_for_derivatives():
         return numbers
+    # E[(x - c, 1) (x - c, 1)'], summed over the modes; its last row and column are those of the constant 1.
     x, weights = moments
     second = jnp.einsum("jac,jc,jbc->ab", x, weights, x)
-    mean = second[:-1, -1] / second[-1, -1]
-    left = eliminate(second[:-1, :-1] / second[-1, -1] - jnp.outer(mean, mean)).weights
-    is_possible = jnp.sum(x[:, -1] ** 2 * weights, axis=1, keepdims=True) > 0  # a mode of no probability has no noise
+    total_probability = second[-1, -1]
+    mean = second[:-1, -1] / total_probability
+    # What is left of each state's variance, given the states before it: the pivots of Cov x.
+    left = eliminate(second[:-1, :-1] / total_probability - jnp.outer(mean, mean)).weights
+    is_state_known = jnp.any(left <= FEW_DIGITS * power)
+    # The same of the noise; a mode of no probability has none.
+    is_possible = jnp.sum(x[:, -1] ** 2 * weights, axis=1, keepdims=True) > 0
     of_noise = jnp.einsum("jlc,jc->l", noise.matrix**2, noise.weights) + jnp.max(power)
-    known = jnp.any(left <= FEW_DIGITS * power) | jnp.any(is_possible & (noise.weights <= FEW_DIGITS**2 * of_noise))
+    is_noise_known = jnp.any(is_possible & (noise.weights <= FEW_DIGITS**2 * of_noise))
+    known = is_state_known | is_noise_known
     return spoil_derivatives(numbers, known)

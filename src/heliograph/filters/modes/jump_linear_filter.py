@@ -76,7 +76,7 @@ class ModalBelief(NamedTuple):
 
     @property
     def law(self) -> jax.Array:
-        """Probabilities of the modes before any data (M,)."""
+        """Probabilities of the modes before any data (M,): the last entry of E[x~ x~' 1{mode}], as that of x~ is 1."""
         return self.moments[:, -1, -1]
 
 
@@ -99,15 +99,17 @@ class AbstractModalFilter(AbstractSizedFilter):
 
     @estimates
     def estimate(self, state: PyTree) -> Estimate:
-        """Return the estimate of x = `projection` zeta, and the covariance of its error.
+        """Return the estimate of x = P zeta, and the covariance of its error.
 
-        zeta holds the products of (x, 1) and functions of the modes.
+        The filter's state is the Gaussian of zeta, which holds the products of (x, 1) and functions of the modes; P is
+        a fixed matrix that picks or sums x among them.
         """
-        projection, x = self._projection_to_state(), state.gaussian
-        return Estimate(projection @ x.mean, WeightedColumns(projection @ x.root, x.variances).covariance, self.claim)
+        projection, zeta = self._projection_to_state(), state.gaussian
+        covariance = WeightedColumns(projection @ zeta.root, zeta.variances).covariance
+        return Estimate(projection @ zeta.mean, covariance, self.claim)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
-        """Precompute all covariances and gains."""
+        """Return the filter with gains and covariances of each step computed in advance, for complete data."""
         return plan_filter(self, inputs, self._projection_to_state())
 
     def process_noise_by_mode(self, u: ArrayLike, k: Step, second_moment: WeightedColumns) -> WeightedColumns:
@@ -200,7 +202,10 @@ class ModalFilter(AbstractJointModalFilter):
         return state._replace(gaussian=corrected), innovation
 
     def _transition_matrix(self, state: ModalBelief, k: Step) -> jax.Array:
-        """Return the transition matrix (M, M) of the chain; the identity before the first prediction."""
+        """Return the transition matrix (M, M) of the modes to step k.
+
+        Before the first prediction the mode keeps its initial law, so that it is the identity.
+        """
         return jnp.where(state.moved, jnp.asarray(at(self.channel, k).transition), jnp.eye(len(state.moments)))
 
     def _transition_factors(self, state: ModalBelief, u: ArrayLike, k: Step) -> tuple[jax.Array, WeightedColumns]:
@@ -221,7 +226,7 @@ class ModalFilter(AbstractJointModalFilter):
         return slopes, join_columns(moved_draw, process_noise)
 
     def _plants(self, k: Step) -> tuple[LinearPlant, ...]:
-        """Return the different plants at step k, of which each mode has one."""
+        """Return the different plants at step k; mode j has that of number `self.plant_modes[j]`."""
         return list_mode_models(at(self.plant, k))
 
     def _motion(self, state: ModalBelief, u: ArrayLike, k: Step) -> MotionByMode:
@@ -234,16 +239,20 @@ class ModalFilter(AbstractJointModalFilter):
         return centred_motion(self._plants(k), self.plant_modes, u, state.centre, means_by_next_mode)
 
     def _measurement_model(self, state: ModalBelief, k: Step) -> MeasurementModel:
-        """Return the model z = common + H zeta + v, with columns of Cov v, for zeta = (x~ 1{mode = 1}, ...).
+        """Return the model z = common + H zeta + v of step k, which is linear in the filter's state zeta.
 
-        In mode j the sensor sends y~ = (y, 1) = C~_j x~ + noise, for x~ = (x - c, 1), and z = G y~ for a random G of
-        mean Hbar_j, whose last column is the link's noise n. So E[z | zeta] = sum_j Hbar_j C~_j x~ 1{mode = j}.
+        zeta holds the products x~ 1{mode = j} for each mode j, with x~ = (x - c, 1) and c = E[x] before any data. In
+        mode j the sensor sends y~ = (y, 1) = C~_j x~ + noise of covariance R~_j, and z = G y~ arrives, where the random
+        G has the mean Hbar_j; its last column is the link's noise. So E[z | zeta] = sum_j Hbar_j C~_j (x~ 1{mode = j}),
+        and v has the covariance sum_j E[(G - Hbar_j) Y_j (G - Hbar_j)'] + P(j) Hbar_j R~_j Hbar_j', Y_j =
+        E[y~ y~' 1{mode = j}].
         """
-        channel, law = at(self.channel, k), state.law
+        channel, law = at(self.channel, k), state.law  # moments of G in each mode, and P(j)
         sensors = list_mode_models(at(self.sensor, k))
-        # C~_j and R~_j, then Hbar_j C~_j with a part that is the same in all modes, as a constant, taken out.
-        sensor_matrices, sensor_noises = centred_sensing(sensors, self.sensor_modes, state.centre)
-        gains = jnp.asarray(channel.mean)
+        sensor_matrices, sensor_noises = centred_sensing(sensors, self.sensor_modes, state.centre)  # C~_j and R~_j
+        gains = jnp.asarray(channel.mean)  # Hbar_j
+        # H is Hbar_j C~_j, mode after mode. Its part that is the same in all modes is taken out as a constant,
+        # `common`.
         matrix, common = subtract_mean_output(gains @ sensor_matrices, law)
         # Y_j = E[y~ y~' 1{mode = j}] = C~_j E[x~ x~' 1{mode = j}] C~_j' + P(j) R~_j (M, p + 1, p + 1)
         signal_moments = propagate_by_mode(sensor_matrices, state.moments, law[:, None, None] * sensor_noises)
@@ -332,7 +341,11 @@ def compute_initial_moments(start: LinearPlant, law: Array) -> tuple[Gaussian, j
 
 
 def mean_from_centre(law: jax.Array, centre: jax.Array) -> jax.Array:
-    """Return P(j) (c, 0), mode after mode: E[(x, 1) 1{mode = j}] less E[(x - c, 1) 1{mode = j}] for the centre c."""
+    """Return P(j) (c, 0), mode after mode: E[(x, 1) 1{mode = j}] less E[(x - c, 1) 1{mode = j}] for the centre c.
+
+    `law` (M,) are the P(j), and `centre` is c (n,). Added to the mean of the products of (x - c, 1) and the modes'
+    indicators, it gives that of the products of (x, 1).
+    """
     return jnp.kron(law, jnp.append(centre, 0.0))
 
 
@@ -352,7 +365,10 @@ def concatenate_modes(output: jax.Array) -> jax.Array:
 
 
 def modal_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> ModalFilter:
-    """Return the best linear filter where links, plant or sensor have modes; `linear_filter` has checked the parts."""
+    """Return the best linear filter where links, plant or sensor have modes: values of hidden Markov chains.
+
+    All modes together are one chain of joint modes. `linear_filter`, which calls this, has checked that the parts fit.
+    """
     models = first(plant), first(sensor)
     # A joint mode is one of plant, sensor and channel together. Here, for each, its models (plant, sensor).
     by_mode = joint_modes(first(channel), beside=models).beside
@@ -376,5 +392,9 @@ def fields_of_joint_modes(plant: AnyPlant, sensor: AnySensor, channel: Channel, 
 
 
 def claim_of_modes(channel: Channel) -> Claim:
-    """Return "exact" if the law of every mode is known, "nominal" if some probability in it is uncertain."""
-    return "exact" if all(m.corner_count() == 1 for c in unstack(channel) for m in joint_modes(c).maps) else "nominal"
+    """Return "exact" if the law of gain and noise in every mode is known, "nominal" if some probability is uncertain.
+
+    An uncertain law is one of a set with several extreme laws (corners); a known one is its own only corner.
+    """
+    maps = [affine for step in unstack(channel) for affine in joint_modes(step).maps]
+    return "exact" if all(affine.corner_count() == 1 for affine in maps) else "nominal"

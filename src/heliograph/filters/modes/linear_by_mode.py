@@ -21,13 +21,19 @@ from heliograph.numerics.types import ArrayLike
 
 
 def transition_with_constant(plant: LinearPlant, u: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return A~ = [[A, B u + E w], [0, 1]] and Q~ = diag(Q, 0) of x~ = (x, 1)."""
+    """Return A~ = [[A, B u + E w], [0, 1]] and Q~ = diag(Q, 0) (n + 1, n + 1) of x~ = (x, 1).
+
+    Then x+ = A x + B u + w is x~+ = A~ x~ + a noise of mean 0 and covariance Q~.
+    """
     matrix = pad_with_zeros(plant.transition_matrix(u)).at[:-1, -1].set(plant.shift(u)).at[-1, -1].set(1.0)
     return matrix, pad_with_zeros(plant.noise_covariance(u))
 
 
 def measurement_with_constant(sensor: LinearSensor) -> tuple[jax.Array, jax.Array]:
-    """Return C~ = [[C, E v], [0, 1]] and R~ = diag(R, 0) of y~ = (y, 1)."""
+    """Return C~ = [[C, E v], [0, 1]] (p + 1, n + 1) and R~ = diag(R, 0) (p + 1, p + 1) of y~ = (y, 1).
+
+    Then y = C x + v is y~ = C~ (x, 1) + a noise of mean 0 and covariance R~.
+    """
     measure = pad_with_zeros(jnp.asarray(sensor.matrix)).at[:-1, -1].set(sensor.noise.mean).at[-1, -1].set(1.0)
     return measure, pad_with_zeros(jnp.asarray(sensor.noise.covariance))
 
@@ -64,7 +70,7 @@ def noise_in_mode(plant: LinearPlant, u: ArrayLike, initial_power: jax.Array) ->
 
 
 def pad_with_zeros(a: jax.Array) -> jax.Array:
-    """Pad A by a row and a column of zeros: [[A, 0], [0, 0]]."""
+    """Return [[A, 0], [0, 0]], A with one more row and column of zeros: those of the constant 1 in (x, 1)."""
     return jnp.pad(a, ((0, 1), (0, 1)))
 
 
@@ -167,12 +173,13 @@ def covariance_of_mode(transition: jax.Array) -> jax.Array:
 def factor_with_last_mode(covariance: jax.Array) -> WeightedColumns:
     """Return columns (M s, ...) of a covariance of M blocks, one a mode, of size s, that sum to 0 over the modes.
 
-    Such are deviations of indicators, which sum to 1. `covariance` (M - 1, s, M - 1, s) is that of all modes but the
-    last, whose block is minus the sum of the others. So the singular covariance of all is never factored.
+    Such are deviations of the modes' indicators from their means, since the indicators sum to 1. `covariance` (M - 1,
+    s, M - 1, s) is that of all modes but the last, whose block is minus the sum of the others: x_M = -sum_j x_j. So the
+    singular covariance of all is never factored.
     """
     other_modes, size = covariance.shape[:2]
     factors = factor_covariance(covariance.reshape(other_modes * size, other_modes * size))
-    minus_sum = -np.tile(np.eye(size), (1, other_modes))
+    minus_sum = -np.tile(np.eye(size), (1, other_modes))  # maps the blocks of all other modes to that of the last
     return factors.through(np.concatenate([np.eye(other_modes * size), minus_sum]))
 
 

@@ -41,11 +41,17 @@ class AbstractMerging(Module):
         return False
 
     def initial_weights(self, law: jax.Array) -> jax.Array:
-        """Return the weights (K, M) of the components before any data, of the modes' law (M,)."""
+        """Return the weights (K, M) of components and modes before any data, from the modes' law (M,).
+
+        Here component j belongs to mode j alone, so that they are diagonal.
+        """
         return jnp.diag(law)
 
     def merge_by_mode(self, gaussians: Gaussian, weight: jax.Array) -> Gaussian:
-        """Return one Gaussian for each mode, from the K components after a correction and their weights (K, M)."""
+        """Return one Gaussian for each mode, from the K components after a correction and their weights (K, M).
+
+        Here there is one component for each mode already.
+        """
         return gaussians
 
     def mixing_weights(self, weight: jax.Array, transition: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -78,9 +84,10 @@ class AbstractMerging(Module):
         return numbers, numbers
 
     def keep_components(self, gaussians: Gaussian, weight: jax.Array, modes: int) -> tuple[Gaussian, jax.Array]:
-        """Return the components after a correction and their weights (K, M).
+        """Return the components that are kept after a correction with z, and their weights (K, M).
 
-        `gaussians` and `weight` (pairs,) hold what `list_update_pairs` lists, after the correction.
+        `gaussians` and `weight` (pairs,) are those of the pairs (component, mode) that `list_update_pairs` lists, after
+        the correction. Here pair j is component j with its own mode j: all are kept, with diagonal weights.
         """
         return gaussians, jnp.diag(weight)
 
@@ -120,7 +127,10 @@ class MergeByMode(AbstractMerging):
 
     @property
     def corrects_pairs(self) -> bool:
-        """True: z corrects a Gaussian for each pair (mode before, mode after a step); these are merged afterwards."""
+        """True: a step's z corrects a Gaussian for each pair (mode before, mode after), and then pairs are merged.
+
+        A smoother asks this, to know whether later data act on Gaussians before z or after it.
+        """
         return True
 
     def mixing_weights(self, weight: jax.Array, transition: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -151,7 +161,10 @@ class MergePairs(AbstractMerging):
 
     @property
     def corrects_pairs(self) -> bool:
-        """True: z corrects a Gaussian for each pair (mode before, mode after a step); these are merged afterwards."""
+        """True: a step's z corrects a Gaussian for each pair (mode before, mode after), and then pairs are merged.
+
+        A smoother asks this, to know whether later data act on Gaussians before z or after it.
+        """
         return True
 
     def merge_by_mode(self, gaussians: Gaussian, weight: jax.Array) -> Gaussian:
@@ -186,12 +199,18 @@ class MergePairs(AbstractMerging):
         return gaussians, self._by_mode(weight, modes)
 
     def _by_mode(self, weight: jax.Array, modes: int) -> jax.Array:
-        """Return the weights (M^2,) of pairs as (M^2, M), each in the column of its present mode."""
+        """Return the weights (M^2,) of pairs (i, j) as a matrix (M^2, M), each in the column of its present mode j.
+
+        Pairs are listed with j running fastest.
+        """
         return jnp.asarray(weight[:, None] * (np.tile(np.arange(modes), modes)[:, None] == np.arange(modes)))
 
 
 def normalise_columns(weight: jax.Array) -> jax.Array:
-    """Divide weights (components, mixtures) by their column sums; a column of zeros becomes equal weights."""
+    """Divide weights (components, mixtures) by their column sums, so that each column is a law.
+
+    A column of zeros, of a mixture that has no probability, becomes equal weights, so that nothing is NaN.
+    """
     total = jnp.sum(weight, axis=0)
     is_positive = total > float(np.finfo(total.dtype).tiny)  # the reciprocal of a smaller number would be infinite
     return jnp.where(is_positive, weight * (1 / jnp.where(is_positive, total, 1.0)), 1 / len(weight))
@@ -284,14 +303,17 @@ def mix_and_predict_by_mode(
 
 
 class MixtureMoments(NamedTuple):
-    """Means (mixtures, n) and covariances (mixtures, n, n)."""
+    """Means (mixtures, n) and covariances (mixtures, n, n) of several mixtures of Gaussians."""
 
     mean: jax.Array
     covariance: jax.Array
 
 
 def mix_moments(gaussians: Gaussian, share: jax.Array) -> MixtureMoments:
-    """Return the moments of mixtures of Gaussians, by their shares (components, mixtures)."""
+    """Return mean and covariance of several mixtures of the same Gaussians.
+
+    `share` (components, mixtures): column g has the shares, which sum to 1, of the components in mixture g.
+    """
     covariances = jax.vmap(lambda x: x.covariance)(gaussians)
 
     def mix(shares: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -324,11 +346,14 @@ def _predict_each(
 
 
 def align_angles(plant: AbstractPlant, mean: jax.Array, weight: jax.Array) -> jax.Array:
-    """Return means (components, n) with angles near those of the most probable component, so that they average."""
+    """Return means (components, n) with full turns added to their angles, so that they may be averaged.
+
+    Each angle is then within half a turn of that of the component with the largest `weight` (components,).
+    """
     return plant.near(mean, mean[jnp.argmax(weight)]) if plant.circular else mean
 
 
 def replicate(x: T, count: int) -> T:
-    """Replicate an object `count` times along a new first axis."""
+    """Return `count` copies of a tree of arrays, stacked along a new first axis of each array."""
     copies: T = jax.tree.map(lambda leaf: jnp.repeat(jnp.asarray(leaf)[None], count, axis=0), x)
     return copies

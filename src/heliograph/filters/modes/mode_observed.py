@@ -55,7 +55,7 @@ class ModeObservedBelief(NamedTuple):
 
     @property
     def gaussian(self) -> Gaussian:
-        """Law of the state given the data."""
+        """The Gaussian of x given the data: of the estimate, not the one before any data."""
         return self.belief.gaussian
 
 
@@ -76,9 +76,10 @@ class ModeObservedFilter(AbstractSizedFilter):
 
     @compile_on_call
     def init(self) -> ModeObservedBelief:
-        """Return the belief before any data.
+        """Return the filter's state before any data: the law of x_0.
 
-        There is no last measurement (z is NaN), and no last step (the matrix is I, without noise).
+        The state also holds the last measurement and the last motion of the plant, to repeat a step whose mode is
+        reported late. There are none yet: z is NaN, and the motion is x+ = x.
         """
         belief = prior_belief(at(self.plant, k=0))
         n = len(belief.gaussian.mean)
@@ -105,9 +106,9 @@ class ModeObservedFilter(AbstractSizedFilter):
     def correct(self, state: ModeObservedBelief, z: ArrayLike, k: Step = 0) -> tuple[ModeObservedBelief, Innovation]:
         """Correct with z, given the states of the links' memories that came with it.
 
-        A link's gain depends on a memory (a Markov chain's mode, or a gain that drifts), which the receiver is told. If
-        `self.late`, it is told the states of the step before: then that step's measurement is used again with them, and
-        z with the law of the present states that follows from them.
+        A link's gain depends on a memory (a Markov chain's mode, or a gain that drifts), which is reported to the
+        receiver. If `self.late`, the states are those of the step before: then that step's measurement is used again
+        with them, and z with the law of the present states that follows from them.
 
         Args:
             state: estimate, and what the last correction used, to repeat it.
@@ -171,14 +172,15 @@ class ModeObservedFilter(AbstractSizedFilter):
 
     @estimates
     def estimate(self, state: ModeObservedBelief) -> Estimate:
-        """Return the mean and covariance of the estimate."""
+        """Return the mean and covariance of x given the data."""
         return Estimate(state.gaussian.mean, state.gaussian.covariance, self.claim)
 
 
 def _find_moments_given_states(channel: AbstractRandomAffine, numbers: jax.Array) -> SecondOrder:
     """Return the mean and covariance of (G, n) in z = G y + n, given the present states of the links' memories.
 
-    A memory is a chain of modes or a gain that drifts, and `numbers` holds its mode's number or the gain.
+    A memory is what the next draw of a link depends on: a Markov chain of modes, or a gain that drifts.
+    `numbers` holds for each memory its mode's number, or the gain, as the receiver was given them.
     """
     states = [m.state_from_number(number) for m, number in zip(memories(channel).values(), numbers, strict=True)]
     return _find_nominal_moments(condition_on_memories(channel, states))

@@ -15,15 +15,13 @@ import numpy as np
 
 from heliograph.factors.covariance_factors import WeightedColumns, decorrelate, join_columns, unit_lower
 from heliograph.factors.factored_gaussian import (
-    BackwardGain,
     Gaussian,
-    condition_on_next_state,
     from_columns,
     merge_mixture,
     moments_of_mixture,
-    rts_step,
     sum_unexplained,
 )
+from heliograph.factors.state_given_next import BackwardGain, condition_on_next_state, rts_step
 from heliograph.filters.gaussian.gaussian_prediction import factor_process_noise, find_transition_moments
 from heliograph.filters.gaussian.moment_transforms import AbstractTransform
 from heliograph.filters.gaussian.signal_moments import condition_on_measurement
@@ -42,7 +40,7 @@ SINGULAR = 1e-12  # of a variance, given the components before it: it is known
 
 
 class ModalLaw(NamedTuple):
-    """A Gaussian for each mode, and the probabilities of the modes.
+    """Joint law of state and mode: the Gaussian of x in each of M modes, and the probabilities of the modes.
 
     Shapes: gaussian (M, n), law (M,).
     """
@@ -140,8 +138,9 @@ def divide_gaussians(later: Gaussian, known: Gaussian) -> FutureObservation:
         later: N(s, S), what is known with later data.
         known: N(q, Q), what is known without the later data.
     """
-    # W with W Q W' = I, and zeros for components that `known` has exactly.
-    variances = jnp.sum(known.root**2 * known.variances, axis=1)
+    # Q = L diag(d) L' by `known.root` and `known.variances`. W = diag(d)^-1/2 L^-1 has W Q W' = I, but for rows of
+    # zeros where d_j is 0 to rounding, as `known` has such a component exactly given those before it.
+    variances = jnp.sum(known.root**2 * known.variances, axis=1)  # Q_jj
     varies = known.variances > SINGULAR * variances
     scale = jnp.where(varies, 1 / jnp.sqrt(jnp.where(varies, known.variances, 1.0)), 0.0)
     n, lower = len(known.mean), unit_lower(known.lower)
@@ -149,7 +148,7 @@ def divide_gaussians(later: Gaussian, known: Gaussian) -> FutureObservation:
     # W S W' = T diag(e) T' and V' = T' W. What is known exactly gets e = 1: later data add no information.
     root = whitening @ later.root
     e, T = eigh((root * later.variances) @ root.T + jnp.diag(jnp.where(varies, 0.0, 1.0)))
-    information = 1 - jnp.maximum(e, 0.0)
+    information = 1 - jnp.maximum(e, 0.0)  # what later data add, as a share of what is known with them
     is_informative = information > NOTHING
     # sqrt(1 - e) (V's - e V'q) / (1 - e) = sqrt(1 - e) V'q + V'(s - q) / sqrt(1 - e).
     scaling = jnp.sqrt(jnp.where(is_informative, information, 1.0))  # sqrt(1 - e)
@@ -182,7 +181,7 @@ class ModalSmootherStep(SmootherStep):
 
     @property
     def end(self) -> ModalLaw:
-        """The law after the step, from which a pass back starts."""
+        """Gaussians and probabilities of the modes after the step: where a pass back over the data starts."""
         return self.law
 
     def back(self, later: ModalLaw) -> ModalLaw:  # type: ignore[override]
@@ -201,7 +200,8 @@ class ModalSmootherStep(SmootherStep):
         def observe(x: Gaussian, observed: FutureObservation) -> tuple[Gaussian, jax.Array]:
             """Condition the Gaussian x of one pair (mode, next mode) on later data; return it and the log-likelihood.
 
-            Later data act like a measurement value = rows x + noise.
+            Later data act like a measurement value = rows x + noise with uncorrelated noises, NaN where they say
+            nothing.
             """
             noise = WeightedColumns(jnp.eye(len(x.mean)), observed.noise)
             expected, slopes = observed.rows @ x.mean, observed.rows @ x.root

@@ -58,9 +58,15 @@ def _check_density(channel: ChannelByPattern) -> None:
 
 
 def find_models(kind: str, model: Any, by_mode: Sequence[Any]) -> tuple[int, ...]:
-    """Return for each joint mode the index of the plant's or sensor's model in it; all 0 if it has no modes.
+    """Return for each joint mode the index of its plant (or sensor) among the different ones; all 0 if it has no modes.
 
-    `by_mode` holds the model in each joint mode. Its index is found by identity.
+    Args:
+        kind: "plant" or "sensor", for the message.
+        model: the plant or sensor; one with modes lists its different `models`.
+        by_mode: the plant or sensor in each joint mode. Its index is found by identity.
+
+    Raises:
+        ValueError: models with modes that vary over time.
     """
     if isinstance(model, OverTime) and isinstance(first(model), ModalPlant | ModalSensor):
         raise fail(kind, "one whose models are the same at all steps", "modes in over_time")

@@ -79,7 +79,7 @@ class ModalBeliefs(NamedTuple):
 
     @property
     def components(self) -> tuple[jax.Array, Gaussian]:
-        """The mixture: probabilities (M,) of the components, and these."""
+        """The law of x as a mixture: the probabilities (K,) of the components, and their Gaussians."""
         return jnp.sum(self.weight, axis=1), self.gaussian
 
 
@@ -104,12 +104,15 @@ class MultipleModelFilter(AbstractSizedFilter):
     takes_rates: ClassVar[bool] = True
 
     def angles_used(self) -> FilterAngles:
-        """Return the angles of its plant, and those that its channel delivers."""
+        """Return the indices of states that are angles, and of components of z that are."""
         return FilterAngles(first(self.plant).angles, self.observed_angles)
 
     @compile_on_call
     def init(self) -> ModalBeliefs:
-        """Return the prior in every component, and the initial law of the modes; `moved` is False before any step."""
+        """Return K equal Gaussians, the law of x_0, with weights that give the modes their initial law.
+
+        `moved` is False until a step is predicted: the modes of the first step have the initial law itself.
+        """
         start, weight = at(self.plant, k=0), self.merging.initial_weights(jnp.asarray(self.initial))
         gaussians = replicate(from_covariance(start.initial_mean, start.initial_covariance), len(weight))
         return ModalBeliefs(gaussians, weight, moved=jnp.asarray(False))
@@ -137,13 +140,20 @@ class MultipleModelFilter(AbstractSizedFilter):
         return ModalBeliefs(predicted, weight, jnp.asarray(True))
 
     def transition_matrix(self, state: ModalBeliefs, u: jax.Array, k: Step) -> jax.Array:
-        """Return the transition matrix (M, M) of the chain; the identity before the first prediction."""
+        """Return the transition matrix (M, M) of the modes over step k, which may depend on the input u (as on dt).
+
+        Before the first prediction the modes keep their initial law, so that it is the identity.
+        """
         rows = transition_over(at(self.plant, k), u, jnp.asarray(at(self.channel, k).transition))
         return jnp.where(state.moved, rows, jnp.eye(len(self.initial)))
 
     @corrects
     def correct(self, state: ModalBeliefs, z: ArrayLike, k: Step = 0) -> tuple[ModalBeliefs, Innovation]:
-        """Correct a Gaussian for each pair (component, mode) with z, and weight the pairs by their likelihood."""
+        """Correct a Gaussian for each pair (component, mode) with z, and weight the pairs by their likelihood.
+
+        A component is one of the Gaussians of the mixture; a pair is its Gaussian in one present mode, whose sensor and
+        link measured z. Which pairs there are, and which Gaussians are kept afterwards, the merging rule decides.
+        """
         channel, z, modes = at(self.channel, k), jnp.asarray(z), len(self.initial)
         _, mode_of_pair = self.merging.list_update_pairs(modes)
         signal, prior_weight = self.prior_signals(state, k)
@@ -155,20 +165,29 @@ class MultipleModelFilter(AbstractSizedFilter):
         return ModalBeliefs(*self.merging.keep_components(gaussians, weight, modes), state.moved), innovation
 
     def prior_signals(self, state: ModalBeliefs, k: Step) -> tuple[Signal, jax.Array]:
-        """Return for pairs (component, mode) that z corrects the moments of the mode's signal, and prior weights."""
+        """Return for each pair (component, mode) that z corrects the moments of its signal y, and its prior weight.
+
+        The signal is that of the mode's sensor, for x from the component's Gaussian.
+        """
         component, mode = self.merging.list_update_pairs(len(self.initial))
         return self.signals_of_pairs(state.gaussian, (component, mode), k), state.weight[component, mode]
 
     def signals_of_pairs(self, components: Gaussian, pairs: tuple[np.ndarray, np.ndarray], k: Step) -> Signal:
         """Return for each pair (component, mode) the moments of the signal y of the mode's sensor, for x ~ component.
 
-        `pairs`: number of the component, and of the mode, in each pair. `components`: Gaussians of x, a leading axis.
+        Several modes may share a sensor, and several pairs a component: moments are found once for each different
+        component and sensor, and copied.
+
+        Args:
+            components: Gaussians of x (components, n).
+            pairs: for each pair the number of its component, and that of its mode.
+            k: step.
         """
         plant, sensors = list_mode_models(at(self.plant, k))[0], list_mode_models(at(self.sensor, k))
         (component, mode), start = pairs, second_moments_at_start(self.plant)
         sensor_of_pair, results = np.array(self.sensor_modes)[mode], list[Signal]()
         for number, sensor in enumerate(sensors):
-            # Each different component of this sensor's pairs goes through the sensor once, and is then copied.
+            # The different components in this sensor's pairs.
             its_components = component[sensor_of_pair == number]
             distinct = np.unique(its_components)
             are_all = len(distinct) == len(components.mean)
@@ -193,7 +212,10 @@ class MultipleModelFilter(AbstractSizedFilter):
         return Estimate(wrap_angles(mean, first(self.plant).angles), covariance, self.claim, state.law)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
-        """Return the step of smoothing by pairs (mode before, mode after), and the mixtures around it as Gaussians."""
+        """Return what a backward pass needs of a step: Gaussians of all pairs (mode i before, mode j after it).
+
+        The mixtures before and after the step, merged to one Gaussian each, are given too, for uses that know no modes.
+        """
         plants, modes = list_mode_models(at(self.plant, step.k)), len(self.initial)
         law = self._find_law_by_mode(step.after)
         terms = self._describe_pairs(step, law)
@@ -209,14 +231,18 @@ class MultipleModelFilter(AbstractSizedFilter):
         )  # fmt: skip
 
     def _find_law_by_mode(self, state: ModalBeliefs) -> ModalLaw:
-        """Return the Gaussian and the probability of each mode, from a filter's state after a correction."""
+        """Return the Gaussian and the probability of each present mode, merged from a filter's components."""
         return ModalLaw(self.merging.merge_by_mode(state.gaussian, state.weight), state.law)
 
     def _describe_pairs(self, step: StepTrace, after: ModalLaw) -> PairSmootherTerms:
-        """Return the terms of a step for a smoother by pairs (mode i before the step, mode j after it).
+        """Return what a smoother needs of a step: for each pair (mode i before it, mode j after it) a Gaussian of x.
 
-        These are Gaussian and probability of each pair, the smoother gain back to mode i, and the Gaussian of each mode
-        j without later data. `step`: states around step k, u and z. `after`: law by mode after the correction.
+        With it the pair's probability, the smoother gain back to mode i, and for each mode j the Gaussian that a
+        smoothed one is divided by, to find what later data alone say.
+
+        Args:
+            step: the filter's states before the step, after its prediction and after its correction, with k, u and z.
+            after: Gaussian and probability of each mode after the correction.
         """
         modes, k, before = len(self.initial), step.k, self._find_law_by_mode(step.before)
         plants, start = list_mode_models(at(self.plant, k)), second_moments_at_start(self.plant)
@@ -240,7 +266,7 @@ class MultipleModelFilter(AbstractSizedFilter):
 
 
 def _merge_mixture(state: ModalBeliefs) -> Gaussian:
-    """Return one Gaussian with the mean and covariance of the mixture."""
+    """Return one Gaussian with the mean and covariance of the mixture of all components, whatever their modes."""
     weights, components = state.components
     return merge_mixture(components, weights)
 

@@ -89,15 +89,16 @@ class ParticleFilter(AbstractSizedFilter):
     seed: Int[Array, ""]  # a number, so that filters of all seeds are one program
 
     def angles_used(self) -> FilterAngles:
-        """Return the angles of its plant, and those that its channel delivers."""
+        """Return the indices of states that are angles, and of components of z that are."""
         return FilterAngles(first(self.plant).angles, self.observed_angles)
 
     @compile_on_call
     def init(self) -> Particles:
         """Return the prior in every particle, with modes in proportion to their initial law.
 
-        Particle i of n has the mode at which the distribution function passes (i + 1/2) / n. `moved` is False until a
-        step is predicted.
+        Particle i of n has the mode at which the distribution function of the law passes (i + 1/2) / n. `moved` is
+        False until a step is predicted: the first prediction draws no new modes, since these are those of the first
+        step.
         """
         start, n = at(self.plant, k=0), self.particles
         gaussians = replicate(from_covariance(start.initial_mean, start.initial_covariance), n)
@@ -146,7 +147,12 @@ class ParticleFilter(AbstractSizedFilter):
         )
         # Each particle is corrected in its own mode: w_i becomes proportional to w_i p(z | mode_i, Gaussian_i).
         corrected, weight, innovation = correct_in_every_mode(
-            signals, channel, state.mode, state.weight, z, self.observed_angles
+            signal=signals,
+            channel=channel,
+            mode=state.mode,
+            weight=state.weight,
+            z=z,
+            angles=self.observed_angles,
         )
         corrected = corrected._replace(mean=align_angles(plant, corrected.mean, weight))
         # Systematic resampling: one uniform number places as many equidistant points on the cumulated weights. The data

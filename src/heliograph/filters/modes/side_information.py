@@ -314,7 +314,10 @@ def _project_on_data(
 
 
 def _join_modes(*parts: jax.Array) -> jax.Array:
-    """Stack the rows of all parts, each (M, rows, columns), with the columns of all modes side by side."""
+    """Return one matrix (rows of all parts, M columns) from parts (M, rows, columns).
+
+    A row of it is one random number over the columns of all modes side by side.
+    """
     rows = jnp.moveaxis(jnp.concatenate(parts, axis=1), 0, 1)
     return rows.reshape(len(rows), -1)
 

@@ -27,7 +27,7 @@ class SideInformationBelief(NamedTuple):
 
     @property
     def moments(self) -> WeightedColumns:
-        """E[q q' 1{mode}] of each mode as columns (M, q, q)."""
+        """E[q q' 1{mode}] of each mode, for q = (e, x~), as columns (M, q, q) with their weights."""
         return WeightedColumns(unit_lower(self.lower), self.variances)
 
     @property
@@ -36,20 +36,24 @@ class SideInformationBelief(NamedTuple):
 
         Each of the M modes has q columns.
         """
+        # The rows of e are the first N of (e, x~); the sum over modes has the weight 1 for each.
         modes, errors_by_mode = len(self.lower), self.moments.matrix[:, : len(self.mean)]
         return side_by_side(WeightedColumns(errors_by_mode, self.moments.weights), np.ones(modes))
 
     @property
     def covariance(self) -> Float[jax.Array, "N N"]:
-        """Second moment E[e e' | side information] of the error."""
+        """E[e e' | side information] (N, N): the covariance of the error e of the estimate, whose mean is 0."""
         return self.errors.covariance
 
 
 def split_columns(state: SideInformationBelief) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Return the columns of e (M, N, q) and of x~ (M, n + 1, q) in each of M modes, and the columns' weights (M, q).
+    """Split the columns of the stacked vector (e, x~) in those of e and those of x~, mode by mode.
 
-    x~ = (x - c, 1), and e is the error of the estimate of its products with the modes' indicators. A second moment in a
-    mode is the weighted sum over the q columns: E[e x~' 1{mode = j}] = sum_q weights_jq e_jq x~_jq'.
+    x~ = (x - c, 1) is the plant's state about c = E[x], with a 1, and e (N,) the error of the filter's estimate. In
+    each of M modes second moments are weighted sums over q columns: E[e x~' 1{mode = j}] = sum_q w_jq e_jq x~_jq'.
+
+    Returns:
+        Columns of e (M, N, q) and of x~ (M, n + 1, q), and their weights w (M, q).
     """
     columns, length_of_e = jnp.asarray(state.moments.matrix), len(state.mean)
     return columns[:, :length_of_e], columns[:, length_of_e:], jnp.asarray(state.variances)
@@ -58,7 +62,7 @@ def split_columns(state: SideInformationBelief) -> tuple[jax.Array, jax.Array, j
 def make_belief(
     mean: jax.Array, moments: WeightedColumns, centre: jax.Array, moved: jax.Array
 ) -> SideInformationBelief:
-    """Return the filter's state.
+    """Return the filter's state, of which factors are stored as their entries below the diagonal.
 
     Args:
         mean: estimate of the products of (x - c, 1) and the modes' indicators.

@@ -123,7 +123,10 @@ class UncertainModalFilter(AbstractJointModalFilter):
         )
 
     def _chain_and_radius(self, state: UncertainBelief, k: Step) -> tuple[jax.Array, jax.Array]:
-        """Return the modes' transition matrix and the radius of its entries; they are I and 0 at the first step."""
+        """Return the modes' nominal transition matrix to step k, and how far each entry may be off (M, M) each.
+
+        They are I and 0 at the first step, before which the modes do not move.
+        """
         channel = at(self.channel, k)
         # Modes keep their initial law up to the first step.
         transition = jnp.where(state.moved, jnp.asarray(channel.transition), jnp.eye(len(state.law)))
@@ -201,7 +204,7 @@ class UncertainModalFilter(AbstractJointModalFilter):
 
 
 def _divide_or_zero(numerator: jax.Array, denominator: jax.Array) -> jax.Array:
-    """Return the quotient, 0 where the denominator is 0."""
+    """Return numerator / denominator, and 0 where the denominator is 0 (or negative, by rounding)."""
     return jnp.where(denominator > 0, numerator / jnp.where(denominator > 0, denominator, 1.0), 0.0)
 
 
@@ -295,7 +298,11 @@ def _largest_payoff(payoff: jax.Array, low: jax.Array, high: jax.Array) -> jax.A
 
 
 def uncertain_modal_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> UncertainModalFilter:
-    """Build the filter behind a channel with an uncertain chain; `linear_filter` has checked that the parts fit."""
+    """Return the filter behind a channel whose modes have uncertain transition probabilities, with an upper bound.
+
+    The covariance bounds the error's for all transition matrices within the given radius, "upper", if the laws of gain
+    and noise in each mode are known; else it is "nominal". `linear_filter` has checked that the parts fit.
+    """
     claim: Claim = "upper" if claim_of_modes(channel) == "exact" else "nominal"
     fields = fields_of_joint_modes(plant, sensor, channel, claim)
     return UncertainModalFilter(plant=plant, sensor=sensor, **fields)

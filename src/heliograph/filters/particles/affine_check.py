@@ -73,7 +73,7 @@ def _classify_dependence(program: core.ClosedJaxpr, arguments: Sequence[_EntryDe
 
 
 def _trace_known_array(value: Any) -> _EntryDegrees:
-    """Return the degrees of a known array."""
+    """Return the degrees of a constant array: KNOWN for each entry, with the array as their value."""
     return _EntryDegrees(np.full(np.asarray(value).shape, KNOWN), value)
 
 
@@ -143,7 +143,12 @@ def _degree_of_arithmetic(name: str, params: dict[str, Any], x: list[_EntryDegre
 
 
 def _degree_of_product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the degrees of products of numbers of degrees a and b."""
+    """Return the degrees of products of numbers of degrees a and b, entry by entry.
+
+    Degrees are ordered: KNOWN (a constant) < GIVEN (no function of the variables) < AFFINE in them < OTHER. If one
+    factor is at most GIVEN, the product has the degree of the other; of two factors that depend on the variables it is
+    OTHER.
+    """
     return np.where(np.minimum(a, b) <= GIVEN, np.maximum(a, b), OTHER)
 
 

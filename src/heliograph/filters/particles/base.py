@@ -24,6 +24,7 @@ from heliograph.numerics.types import Array, Int, PyTree
 
 ENOUGH = 200  # particles; of 100 a row takes 80 us in lanes and half of it otherwise, of 300 90 and three times that
 State = TypeVar("State", bound=tuple[Any, ...])
+Expectations = tuple[jax.Array, ...]  # what a particle expects of z, one or several arrays; (N, ...) of N particles
 
 
 class ResampledParticles(NamedTuple):
@@ -66,8 +67,16 @@ class AbstractStateParticleFilter(AbstractSizedFilter):
     seed: Int[Array, ""]  # a number, so that filters of all seeds are one program
 
     def angles_used(self) -> FilterAngles:
-        """Return the angles of its plant, and those that its channel delivers."""
+        """Return the indices of states that are angles, and of components of z that are.
+
+        The plants of all modes have the same states, so that those of the first mode stand for all.
+        """
         return FilterAngles(list_mode_models(first(self.plant))[0].angles, self.observed_angles)
+
+    def start_keys(self) -> tuple[jax.Array, jax.Array]:
+        """Return two random keys, both from the seed: that of the first step, and that of the draws of x_0."""
+        key, start_key = jax.random.split(jax.random.PRNGKey(self.seed))
+        return key, start_key
 
     def filter_rows(self, z: Array, u: Array, state: PyTree | None = None, begin: Array | int = 0) -> ScanResult | None:
         """Filter rows of data in native code, a SIMD lane for each particle; None if there are too few particles."""
@@ -97,16 +106,19 @@ class AbstractStateParticleFilter(AbstractSizedFilter):
 
     @abstractmethod
     def estimate_from_sums(self, sums: StateSums, second: jax.Array) -> Estimate:
-        """Return mean and covariance: of `sums`, and of the second sums (n, n) about this mean, over all particles."""
+        """Return the estimate: the mean from `sums`, the covariance from `second`, both over all particles.
+
+        `second` (n, n) is the sum of w d d' with the difference d of each particle from that mean.
+        """
 
     @abstractmethod
     def sum_received(
-        self, reference: tuple[Any, ...], weight: jax.Array, predicted: tuple[Any, ...], z: jax.Array, k: Step
-    ) -> Any:
-        """Return weighted sums over B particles of innovations of z less a reference innovation.
+        self, reference: Expectations, weight: jax.Array, predicted: Expectations, z: jax.Array, k: Step
+    ) -> PyTree:
+        """Return sums over B particles, from which E z and Cov z follow: of w_i, w_i d_i and w_i d_i d_i'.
 
-        They give the mean and covariance of z over all particles. The reference is subtracted so that no digits are
-        lost if z is far from 0.
+        w_i is the weight of particle i, and d_i = e_i - e_r its innovation e_i = z - E[z | particle i] less that of a
+        reference particle r. So no digits are lost if z is far from 0. Sums of several groups of particles add up.
 
         Args:
             reference: what one particle, the heaviest, expects of z: arrays as in `predicted`, without a first axis.
@@ -118,12 +130,18 @@ class AbstractStateParticleFilter(AbstractSizedFilter):
 
     @abstractmethod
     def innovation_from_sums(
-        self, received: Any, reference: tuple[Any, ...], z: Any, k: Step, density: Any
+        self, received: PyTree, reference: Expectations, z: jax.Array, k: Step, density: jax.Array
     ) -> Innovation:
-        """Return z - E z, Cov z and the log-likelihood, from sums over all particles.
+        """Return the innovation z - E z = e_r + sum w_i d_i / sum w_i, its covariance Cov z, and log p(z).
 
-        `received`: sums by `sum_received`. `reference`: what the heaviest particle expects of z, whose innovation was
-        subtracted in them. `density`: log p(z).
+        e_r is the innovation of a reference particle r, and d_i = e_i - e_r that of particle i less it.
+
+        Args:
+            received: the sums of w_i, w_i d_i and w_i d_i d_i' over all particles, as `sum_received` makes them.
+            reference: what particle r, the heaviest, expects of z: e_r = z - that.
+            z: measurement (m,), NaN for what did not arrive.
+            k: step.
+            density: log p(z), which is found by the weights, and put into the result as it is.
         """
 
     def compute_estimate(self, state: Any) -> Estimate:
@@ -135,10 +153,17 @@ class AbstractStateParticleFilter(AbstractSizedFilter):
     def compute_innovation(
         self, weight: jax.Array, predicted: tuple[jax.Array, ...], z: jax.Array, k: Step, density: jax.Array
     ) -> Innovation:
-        """Return z - E z, the covariance of z and the log-likelihood, by sums over the particles (N,).
+        """Return z - E z over N weighted particles, its covariance Cov z, and log p(z).
 
-        `predicted` holds what each particle expects of z, and `density` is log p(z). The expectation of the heaviest
-        particle is subtracted first, so that large numbers keep their digits.
+        The expectation of the heaviest particle is subtracted before anything is summed, so that large numbers keep
+        their digits.
+
+        Args:
+            weight: of the particles before z is known (N,).
+            predicted: what each particle expects of z, as one or several arrays (N, ...).
+            z: measurement (m,), NaN for what did not arrive.
+            k: step.
+            density: log p(z), which the weights after z have given.
         """
         heaviest = find_reference_particle(weight, predicted)
         reference = tuple(expectations[heaviest] for expectations in predicted)
@@ -157,6 +182,7 @@ class AbstractStateParticleFilter(AbstractSizedFilter):
         weights do not change.
         """
         weight = jax.nn.softmax(log_weight)
+        # The effective number is 1 / sum w_i^2: N if all weights are equal, 1 if one particle has all the weight.
         resamples = effective_number(weight) < jnp.asarray(self.resample) * self.particles
         start, all_particles = jax.random.uniform(key, (), weight.dtype), jnp.arange(self.particles)
         indices = jax.lax.cond(resamples, resample_systematically, lambda *_: all_particles, weight, start)
@@ -164,12 +190,18 @@ class AbstractStateParticleFilter(AbstractSizedFilter):
 
 
 def update_if_used(used: jax.Array, updated: State, before: State) -> State:
-    """Return the updated state where the row is used, else the state before."""
+    """Return the updated state where the flag `used` () holds, else the state before: two trees of arrays alike.
+
+    A row of data is not used if nothing arrived, or if no particle can have produced it.
+    """
     chosen: State = jax.tree.map(lambda new, old: jnp.where(used, new, old), updated, before)
     return chosen
 
 
 def relative_to_largest(log_weight: jax.Array) -> jax.Array:
-    """Return log weights of which the largest is 0, where it is finite."""
+    """Return log weights (N,) less the largest of them, so that exp does not overflow.
+
+    If all are -inf, they are returned as they are.
+    """
     largest = jnp.max(log_weight)
     return log_weight - jnp.where(jnp.isfinite(largest), largest, 0.0)

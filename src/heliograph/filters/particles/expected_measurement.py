@@ -14,6 +14,16 @@ from heliograph.numerics.numpy_or_jax import library
 from heliograph.numerics.types import Array
 
 
+class InnovationSums(NamedTuple):
+    """Weighted sums over pairs of particle and Gaussian of their innovations d (m,), less a reference innovation.
+
+    `first`: sums of w, w^2 and w d; `second`: the sum of w d d' (m, m).
+    """
+
+    first: FirstSums
+    second: jax.Array
+
+
 class ExpectedMeasurement(NamedTuple):
     """The law of z (m,) given y = h(x), as a mixture of Gaussians (atoms), and y (p,) of a reference particle.
 
@@ -49,18 +59,18 @@ class ExpectedMeasurement(NamedTuple):
         difference = wrap_near(value - self.base, jnp.zeros(len(self.z)), self.angles)
         return joint_weight.ravel(), difference.reshape(-1, len(self.z))
 
-    def compute_innovation(self, first: FirstSums, second: jax.Array, density: jax.Array) -> Innovation:
-        """Return mean and covariance of the innovation, and log p(z).
+    def compute_innovation(self, sums: InnovationSums, density: jax.Array) -> Innovation:
+        """Return the innovation z - E z, its covariance Cov z, and log p(z).
 
-        Cov z is the mean noise covariance of the Gaussians (atoms) that z is given h(x), plus the covariance of their
-        means over all particles and atoms.
+        Given y = h(x), z is a mixture of Gaussians (atoms). Cov z is the mean covariance of these Gaussians, plus the
+        covariance of their means over all particles and atoms.
 
         Args:
-            first: first sums of the innovations less the base, a reference innovation.
-            second: second sums (m, m) of the same differences.
+            sums: of the innovations of all particles and atoms, less the base: a reference innovation.
             density: log p(z), used only if something arrived.
         """
-        mean, present = first.mean(()), ~jnp.isnan(self.z)
+        first, second = sums
+        mean, present = first.mean(angles=()), ~jnp.isnan(self.z)
         noise = jnp.einsum("a,aij->ij", jnp.asarray(self.atoms.weight), jnp.asarray(self.atoms.noise))
         noise = jnp.where(present[:, None] & present, noise, jnp.nan)
         covariance_of_means = second / first.weight - jnp.outer(mean, mean)
@@ -71,6 +81,7 @@ class ExpectedMeasurement(NamedTuple):
 def find_reference_particle(weight: Array, predicted: tuple[Array, ...]) -> Array:
     """Return the index of the heaviest particle (N,) with finite expectations, or of the heaviest if no one has any.
 
+    Its innovation is subtracted from all others before they are summed, so that differences keep their digits.
     `predicted` holds what particles expect of z, in several arrays (N, ...).
     """
     xp = library(weight, predicted)

@@ -33,6 +33,8 @@ def build_partly_drawn(
 ) -> PartlyDrawnFilter:
     """Return the particle filter that draws modes and named states; each particle keeps a Gaussian of the others.
 
+    A mode chooses the laws of plant, sensor and links; modes follow one Markov chain.
+
     Args:
         plant: the plant, maybe of several modes.
         sensor: its sensor, maybe of several modes.
@@ -52,16 +54,18 @@ def build_partly_drawn(
     _check_linear_given(plant, sensor, drawn_indices)
     # One chain of the modes of plant, sensor and links: joint.beside has the pair (plant, sensor) of each joint mode.
     joint = joint_modes(first(channel), nodes, beside=(first(plant), first(sensor)))
+    # For each joint mode the index of its sensor among the sensor's models.
     sensor_modes = find_models("sensor", sensor, [model for _, model in joint.beside])
-    # The density of z in each mode, for each step that sensor or channel covers; one step stands for all if none
-    # varies.
+    # The density of z in each mode, from the mode's sensor and link (`maps`), for each step that sensor or channel
+    # covers; one step stands for all if none varies.
     steps = steps_covered((sensor, channel)) or 1
     densities = []
     for sensor_of_step, link in zip(
         list_models_by_step(sensor, steps), list_models_by_step(channel, steps), strict=True
     ):
-        maps = joint_modes(link, nodes, beside=(first(plant), first(sensor))).maps
-        densities.append(find_received_density([list_mode_models(sensor_of_step)[i] for i in sensor_modes], maps))
+        link_by_mode = joint_modes(link, nodes, beside=(first(plant), first(sensor))).maps
+        sensors = list_mode_models(sensor_of_step)
+        densities.append(find_received_density([sensors[i] for i in sensor_modes], link_by_mode))
     return PartlyDrawnFilter(
         plant=drop_names(plant),
         sensor=drop_names(sensor),
@@ -92,7 +96,11 @@ def _find_indices_of_drawn(start: AbstractPlant, drawn: Sequence[str] | None) ->
 
 
 def _check_linear_given(plant: AnyPlant, sensor: AnySensor, drawn: tuple[int, ...]) -> None:
-    """Raise ValueError unless, given the drawn states, the rest is Gaussian and moves and is measured linearly."""
+    """Raise ValueError unless, given the drawn states, the rest is Gaussian and moves and is measured linearly.
+
+    Only then may each particle hold a Gaussian of the rest. It is asked of the plants and sensors of all modes and
+    steps; whether a function is affine in the rest is read off its operations.
+    """
     for model in [model for step in unstack(plant) for model in list_mode_models(step)]:
         rest = [i for i in range(len(model.states)) if i not in drawn]
         names = [model.states[i] for i in rest]

@@ -14,7 +14,10 @@ from heliograph.numerics.types import Bool, Float, Int
 
 
 class Cloud(NamedTuple):
-    """Particles (N, ...): the Gaussian of x in every mode, and log probabilities of the modes (N, M)."""
+    """N particles, each a mixture: the Gaussian of x (n,) in each of M modes, and log probabilities of the modes.
+
+    Shapes: the Gaussians (N, M, n), log_mode (N, M).
+    """
 
     gaussian: Gaussian
     log_mode: jax.Array
@@ -49,16 +52,17 @@ class PartlyDrawn(NamedTuple):
 
 
 def repeat_for_modes(x: Gaussian, modes: int) -> Gaussian:
-    """Return Gaussians (N, n) as those of every mode (N, M, n)."""
+    """Return N Gaussians of n states, each repeated for every one of M modes: means (N, n) become (N, M, n)."""
     repeated: Gaussian = jax.tree.map(lambda leaf: jnp.repeat(leaf[:, None], modes, axis=1), x)
     return repeated
 
 
 def sum_clouds_for_mean(weight: jax.Array, particles: Cloud, angles: Angles) -> StateSums:
-    """Return the first sums over particles (B,) and modes, and the sum of weights in each mode (None for one mode).
+    """Return sums over B particles, from which the mean of x and the modes' probabilities follow.
 
-    Each particle has a Gaussian in each of M modes. The first sums are those of weights, of squared weights, of means,
-    and of the angles' sines and cosines: E exp(i angle) of a Gaussian angle is exp(i mean - variance / 2).
+    Each particle is a mixture of a Gaussian in each of M modes. The sums are those of weights, of squared weights, of
+    weighted means, and of weighted sines and cosines of angles: a Gaussian angle has E exp(i angle) =
+    exp(i mean - variance / 2). Beside them the sum of weights in each mode (M,), None if there is one mode.
     """
     weights, mean = _list_parts(weight, particles)
     variances = jnp.diagonal(particles.gaussian.covariance, axis1=-2, axis2=-1).reshape(mean.shape)
@@ -71,7 +75,12 @@ def sum_clouds_for_mean(weight: jax.Array, particles: Cloud, angles: Angles) -> 
 
 
 def sum_clouds_for_covariance(weight: jax.Array, particles: Cloud, sums: StateSums, angles: Angles) -> jax.Array:
-    """Return the second sums (n, n) of particles (B,) and modes about the mean of all."""
+    """Return the sum over particles and modes of w (d d' + P) (n, n), from which the covariance of x follows.
+
+    w is a particle's weight times its mode's probability, P the Gaussian's covariance and d the difference of its mean
+    from the mean of all particles, which `sums` (over all of them) give. Differences of `angles` are within half a
+    turn.
+    """
     weights, mean = _list_parts(weight, particles)
     deviation = wrap_angles(mean - sums.first.mean(angles), angles)
     n = mean.shape[1]
@@ -80,9 +89,9 @@ def sum_clouds_for_covariance(weight: jax.Array, particles: Cloud, sums: StateSu
 
 
 def _list_parts(weight: jax.Array, particles: Cloud) -> tuple[jax.Array, jax.Array]:
-    """Return weights (B M,) of particles and modes, and their means (B M, n).
+    """Return a list of all pairs of particle and mode: their weights (B M,), and means of their Gaussians (B M, n).
 
-    A particle has M modes, each with a Gaussian of n states and a log probability.
+    A pair's weight is the particle's weight (`weight` (B,)) times the probability of the mode.
     """
     x, log_mode = particles
     weights = (weight[:, None] * jax.nn.softmax(log_mode, axis=1)).ravel()

@@ -15,7 +15,7 @@ from heliograph.numerics.gaussian_density import LOG_TURN
 def slopes_given_drawn(
     function: Callable[[jax.Array], jax.Array], x: Gaussian, drawn: int
 ) -> tuple[jax.Array, jax.Array]:
-    """Return f(mean), and the slopes (m, n) of f in xi at the mean, for x = mean + L xi with a triangular factor L.
+    """Return f(mean) (m,), and the slopes df/dxi (m, n) of f at the mean, for x = mean + L xi with a triangular L.
 
     The first `drawn` states are known and have no variance, so that the slopes in their xi are 0.
     """
@@ -53,8 +53,9 @@ def find_states_without_variance(x: Gaussian, d: jax.Array) -> jax.Array:
 def condition_on_leading_states(x: Gaussian, d: jax.Array, certain: jax.Array) -> tuple[Gaussian, jax.Array]:
     """Return x given its leading states d (drawn,), and the log of their density.
 
-    With x = mean + L xi and a unit triangular L, xi_i is the difference of state i from its mean given the states
-    before it, of variance `variances`[i]. A `certain` state has no variance and no density, and adds 0 to the log.
+    The Gaussian is x = mean + L xi with a unit lower triangular L (`root`) and uncorrelated xi: xi_i is the difference
+    of state i from its mean given the states before it, of variance `variances`[i]. So xi = L^-1 (d - mean) of the
+    leading states. A `certain` (drawn,) state has no variance and no density, and adds 0 to the log.
     """
     drawn = len(d)
     xi = decorrelate(x.root[:drawn, :drawn], (d - x.mean[:drawn])[:, None])[:, 0]
@@ -67,5 +68,9 @@ def condition_on_leading_states(x: Gaussian, d: jax.Array, certain: jax.Array) -
 
 
 def draw_index(log_weight: jax.Array, uniform: jax.Array) -> jax.Array:
-    """Draw an index with probabilities exp(log_weight) / sum for each row (N, M), by one uniform number each (N,)."""
-    return jnp.sum(jnp.cumsum(jax.nn.softmax(log_weight, axis=1), axis=1)[:, :-1] <= uniform[:, None], axis=1)
+    """Draw an index for each row of log weights (N, M), by one uniform number of [0, 1) each (N,).
+
+    Index j has the probability exp(log_weight_j) / sum. It is drawn where the cumulated probabilities pass the number.
+    """
+    cumulated = jnp.cumsum(jax.nn.softmax(log_weight, axis=1), axis=1)
+    return jnp.sum(cumulated[:, :-1] <= uniform[:, None], axis=1)

@@ -30,16 +30,20 @@ class FirstSums(NamedTuple):
 
 
 class StateSums(NamedTuple):
-    """First sums of the states of particles, and of the weights of modes (modes,), without any where there is one."""
+    """Sums over particles, from which their mean follows, and the sum of weights in each mode (M,).
+
+    `modes` is None where there is only one mode.
+    """
 
     first: FirstSums
     modes: jax.Array | None
 
 
 def first_sums(weight: jax.Array, x: jax.Array, angles: Angles) -> FirstSums:
-    """Return the first sums of numbers x (N, n) by weights (N,), which need not sum to 1.
+    """Return sums over N particles x (N, n) with weights w (N,), from which their weighted mean follows.
 
-    These are the sums of the weights, of their squares, of x, and of sine and cosine of the components that are angles.
+    They are the sums of w, w^2, w x, and of w sin x and w cos x of the components that are angles. The weights need not
+    sum to 1, and the sums of several groups of particles add up.
     """
     angle_columns = x[:, list(angles)]
     sum_of_squares = jnp.sum(weight**2)
@@ -53,7 +57,7 @@ def second_sums(weight: jax.Array, differences: jax.Array) -> jax.Array:
 
 
 def pack_sums(sums: PyTree) -> jax.Array:
-    """Return sums as one vector."""
+    """Return a tree of sums as one vector: native code adds up groups of particles in vectors."""
     return jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(sums)])
 
 

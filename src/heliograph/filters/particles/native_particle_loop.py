@@ -17,6 +17,7 @@ from heliograph.engine.choice import choose_code, compute_once
 from heliograph.filters.particles.expected_measurement import find_reference_particle
 from heliograph.filters.particles.moments import pack_sums, unpack_sums
 from heliograph.filters.particles.resampling import (
+    KeysOfRows,
     draw_keys_of_rows,
     draw_keys_of_rows_by_xla,
     resample_concrete_weights,
@@ -190,12 +191,12 @@ def _compile_call(function: Call, filter: Any, arguments: tuple[Any, ...], diffe
 
 
 def _draw_start(filter: Any, key: Array, number: Array) -> PyTree:
-    """Return the particle of this number before any row, drawn with the key."""
+    """Return the particle of this number at the start, drawn from the law of x_0 with the key."""
     return _take_first(filter.draw_start(key, number[None]))
 
 
 def _take_first(tree: PyTree) -> PyTree:
-    """Return the first of arrays along their leading axis."""
+    """Return the first entry of each array of a tree along its leading axis: one particle of several."""
     return jax.tree.map(lambda leaf: leaf[0], tree)
 
 
@@ -220,7 +221,7 @@ def _advance_particle(
 def _sum_for_mean(
     filter: Any, row: DataRow, reference: tuple[Array, ...], group: ParticleGroup
 ) -> tuple[jax.Array, jax.Array]:
-    """Return two vectors: the first sums of a group's states, and the sums of what its particles expect of z."""
+    """Return as vectors the filter's sums for the mean of x, by weights after z, and for that of z, by those before."""
     group = jax.tree.map(jnp.asarray, group)
     states = filter.sum_for_mean(group.weight, group.particles)
     received = filter.sum_received(reference, group.prior, group.predicted, row.z, row.k)
@@ -258,36 +259,34 @@ def _filter_rows(filter: Any, z: np.ndarray, u: np.ndarray, state: PyTree | None
     """
     # Random keys of all rows at once: they depend on the data, and on no particle.
     key = None if state is None else np.asarray(state.key)
-    start_key, choice_starts, last_key, noise_keys, proposal_keys = compute_once(
-        draw_keys_of_rows, draw_keys_of_rows_by_xla, (filter, z, key)
-    )
+    keys: KeysOfRows = compute_once(draw_keys_of_rows, draw_keys_of_rows_by_xla, (filter, z, key))
     # Number of each step, and whether particles move before it: in all rows but the very first.
     k = begin + np.arange(len(z))
     moved = (np.arange(len(z)) > 0) | (state is not None and bool(state.moved))
-    rows = DataRow(k=k, z=z, u=u, noise_key=noise_keys, proposal_key=proposal_keys, moved=moved)
-    programs = _compile_programs(filter, z, u, (noise_keys, proposal_keys))
+    rows = DataRow(k=k, z=z, u=u, noise_key=keys.noises, proposal_key=keys.proposals, moved=moved)
+    programs = _compile_programs(filter, z, u, (np.asarray(keys.noises), np.asarray(keys.proposals)))
     if programs is None:
         return None
     # The particles before the first row: drawn, or taken from the state.
     loop = _ParticleLoop(filter, programs)
     if state is None:
         numbers = programs.memory.numbers[: filter.particles]
-        draw = _compile_call(_draw_start, filter, (start_key, numbers), (False, True))
+        draw = _compile_call(_draw_start, filter, (keys.start, numbers), (False, True))
         if draw is None:
             return None
-        loop.set_particles(draw(start_key, numbers), np.zeros(filter.particles))
+        loop.set_particles(draw(keys.start, numbers), np.zeros(filter.particles))
     else:
         loop.set_particles(jax.tree.map(np.asarray, filter.get_particles(state)), np.asarray(state.log_weight))
     # Row by row the sums over particles; then the outputs of all rows from these sums, computed side by side.
     steps = [
         loop.filter_row(DataRow(*row), choice_start)
-        for row, choice_start in zip(zip(*rows, strict=True), choice_starts.tolist(), strict=True)
+        for row, choice_start in zip(zip(*rows, strict=True), keys.choice_starts.tolist(), strict=True)
     ]
     sums: ParticleSums = jax.tree.map(lambda *parts: np.stack(parts), *steps)
     outputs = choose_code(_make_outputs_of_row, (filter, rows, sums), differs_by_run=[False, True, True])
     if outputs.code is None:
         return None
-    return ScanResult(loop.last_state(last_key), outputs.results())
+    return ScanResult(loop.last_state(np.asarray(keys.last)), outputs.results())
 
 
 class _ParticleLoop:
@@ -298,7 +297,8 @@ class _ParticleLoop:
 
         A program writes particles to other arrays than it reads: `array_pairs` holds (written, read) of each leaf.
         """
-        self.filter, self.programs, self.memory, self.count = filter, programs, programs.memory, filter.particles
+        self.filter, self.count = filter, filter.particles
+        self.programs, self.memory = programs, programs.memory
         self.resample = float(filter.resample)
         self.sum_of_weights, self.sum_of_squares = 0.0, 0.0
         self.particles, self.log_weight, self.predicted = programs.particles, programs.log_weight, programs.predicted

@@ -79,7 +79,10 @@ def propose_particles(
     from_prior = jnp.zeros(len(drawn), bool) if is_exact else drawn < prior_share
 
     def propose_one(center: jax.Array, draw: jax.Array, from_prior: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return the position of one particle, and the correction of its log weight."""
+        """Return the position center + G e of one particle, and log N(e; 0, I) - log q(e).
+
+        `draw` (n,) is standard normal. It is e itself if the particle is drawn `from_prior`, else e is made of it by q.
+        """
         # C = M H G, and r = z - M h(m) - c.
         slope = jnp.asarray(sensor.matrix) if isinstance(sensor, LinearSensor) else jax.jacfwd(sensor.measure)(center)
         columns = jnp.where(arrived[:, None], gain @ slope @ moved.root, 0.0)
@@ -116,5 +119,5 @@ def share_drawn_from_prior(sensors: Sequence[AbstractSensor], atoms: int, optima
 
 
 def factor_noise_covariance(plant: AbstractPlant, u: jax.Array) -> WeightedColumns:
-    """Return the factors of Cov w (n, n) of a plant under the input u."""
+    """Return columns W and weights w of Cov w = W diag(w) W' (n, n), of a plant x+ = f(x, u) + w under the input u."""
     return plant.noise.columns if isinstance(plant.noise, AbstractNoise) else columns_of(plant.noise_covariance(u))

@@ -19,6 +19,7 @@ from heliograph.factors.factored_gaussian import Gaussian, from_columns, from_co
 from heliograph.filters.base import Step, corrects, estimates, predicts
 from heliograph.filters.particles.base import (
     AbstractStateParticleFilter,
+    Expectations,
     WeighedParticles,
     relative_to_largest,
     update_if_used,
@@ -91,13 +92,8 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         return Cloud(state.gaussian, state.log_mode)
 
     def make_state(self, particles: Cloud, log_weight: jax.Array, key: jax.Array) -> PartlyDrawn:
-        """Return the state of particles with these log weights."""
+        """Return the filter's state of particles with these log weights (N,), after a first move."""
         return PartlyDrawn(particles.gaussian, particles.log_mode, log_weight, key, jnp.asarray(True))
-
-    def start_keys(self) -> tuple[jax.Array, jax.Array]:
-        """Return the key of the first step, and that of the draws of x_0."""
-        key, start_key = jax.random.split(jax.random.PRNGKey(self.seed))
-        return key, start_key
 
     def draw_start(self, key: jax.Array, numbers: jax.Array) -> Cloud:
         """Return the particles with these indices (B,): the Gaussian of x_0 in each mode, and the modes' log law.
@@ -114,11 +110,15 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
 
     @predicts
     def predict(self, state: PartlyDrawn, u: Any = (), k: Step = 0) -> PartlyDrawn:
-        """Resample if the effective number is too small, then draw modes and states, and move them by the plants."""
+        """Resample if the effective number is too small, then move each particle over the step.
+
+        Its mode and the states named in `drawn=` are drawn; the other states stay a Gaussian given these, which the
+        plant of each mode that may follow moves by its mean and covariance.
+        """
         key, choice_key, draw_keys = self.keys_of_prediction(state.key)
         chosen, log_weight = self.choose_particles(state.log_weight, choice_key)
         particles = jax.tree.map(lambda leaf: leaf[chosen], self.get_particles(state))
-        predicted, _ = self.move_particles(particles, None, draw_keys, jnp.asarray(u), k, state.moved)
+        predicted, _ = self.move_particles(particles, None, draw_keys, jnp.asarray(u), k, state.moved)  # None: all
         return self.make_state(predicted, log_weight, key)
 
     def keys_of_prediction(self, key: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -159,7 +159,7 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         return all(isinstance(plant, LinearPlant) and not plant.circular for plant in plants)
 
     def _draw_states(self, x: Gaussian, key: jax.Array, numbers: jax.Array | None) -> Gaussian:
-        """Return Gaussians (B, n) given their drawn states, which are drawn here."""
+        """Draw the leading `self.drawn` states of B Gaussians; return the Gaussians given them."""
         return jax.vmap(condition_on_draw)(x, draw_normals(key, numbers, self.drawn, self.particles))
 
     def _move_particle(self, plant: AbstractPlant, x: Gaussian, u: jax.Array) -> Gaussian:
@@ -178,15 +178,14 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         return from_columns(mean + plant.noise_mean()[order], columns)
 
     def _in_plants_order(self, x: jax.Array) -> jax.Array:
-        """Return x (..., n) in the order of the plant's states."""
+        """Return x (..., n), which has the drawn states first, in the order of the plant's states."""
         return x[..., np.argsort(self.order)]
 
     @corrects
     def correct(self, state: PartlyDrawn, z: Any, k: Step = 0) -> tuple[PartlyDrawn, Innovation]:
         """Draw each particle's mode j and some of its states d with z, and condition its other states on z.
 
-        They are drawn from a law q(j, d) near their posterior, so that the weight is multiplied by p(j, d, z) / q(j,
-        d).
+        They are drawn from a law q(j, d) near their posterior: the weight is multiplied by p(j, d, z) / q(j, d).
         """
         z = jnp.asarray(z)
         key, proposal_keys = self.keys_of_correction(state.key, z)
@@ -359,7 +358,7 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         )
 
     def sum_received(
-        self, reference: tuple[Any, ...], weight: jax.Array, predicted: tuple[Any, ...], z: jax.Array, k: Step
+        self, reference: Expectations, weight: jax.Array, predicted: Expectations, z: jax.Array, k: Step
     ) -> ReceivedSums:
         """Return weighted sums, over B particles and the Gaussians that each expects of z, of the innovations of z.
 
@@ -370,7 +369,7 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         return sum_mixtures(base, weight, ExpectedMixture(*predicted), z, self.observed_angles)
 
     def innovation_from_sums(
-        self, received: ReceivedSums, reference: tuple[Any, ...], z: jax.Array, k: Step, density: jax.Array
+        self, received: ReceivedSums, reference: Expectations, z: jax.Array, k: Step, density: jax.Array
     ) -> Innovation:
         """Return z - E z and Cov z over the mixtures that all particles expect of z, and the log-likelihood of z.
 
@@ -384,7 +383,7 @@ class PartlyDrawnFilter(AbstractStateParticleFilter):
         return sum_clouds_for_mean(weight, particles, self._angles_in_order())
 
     def sum_for_covariance(self, weight: jax.Array, particles: Cloud, sums: StateSums) -> jax.Array:
-        """Return the second sums (n, n) of particles (B,) about the mean of all, drawn states first."""
+        """Return sums of w (d d' + P) (n, n) over B particles and modes, with d the mean's difference from all's."""
         return sum_clouds_for_covariance(weight, particles, sums, self._angles_in_order())
 
     def estimate_from_sums(self, sums: StateSums, second: jax.Array) -> Estimate:

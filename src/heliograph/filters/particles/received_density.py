@@ -38,7 +38,7 @@ class ReceivedAtoms(Module):
     noise: Array
 
     def expected(self, y: jax.Array) -> jax.Array:
-        """Return E[z | y, atom] of each atom, (a, m)."""
+        """Return E[z | y, atom] = gain y + offset of each Gaussian (atom) of the mixture, (a, m)."""
         expected: jax.Array = jnp.asarray(self.gain) @ y + jnp.asarray(self.offset)
         return expected
 
@@ -90,9 +90,10 @@ def _log_density_of_atom(expected: jax.Array, noise: jax.Array, z: jax.Array, an
 
 
 class ReceivedDensity(Module):
-    """Atoms of what is received at one step, in each mode, for each set of components that arrive together.
+    """Law of z given h(x) at one step: in each of M modes, for each of A sets of components that arrive together.
 
-    Shapes: present (A, m), chance (M, A), and the atoms' with first axes (M, A).
+    `present` (A, m) are the sets, `chance` (M, A) the probability of each set in each mode, and `atoms` the Gaussians
+    whose mixture is the law of what arrives, with first axes (M, A).
     """
 
     present: Bool[Array, "A m"]
@@ -128,7 +129,11 @@ class ReceivedByMode(NamedTuple):
 
 
 def find_received_by_mode(z: jax.Array, atoms: ReceivedAtoms) -> ReceivedByMode:
-    """Return z with the Gaussians (atoms) of each mode's mixture, and with the one Gaussian that has their moments."""
+    """Return z (m,) with its law given h(x) in each mode: the mixture of Gaussians (atoms), and one Gaussian.
+
+    The one Gaussian has the moments of the mixture: with it a particle's posterior is computed to draw from. Noises are
+    returned as columns of their covariances.
+    """
     gain, offset, noise = jax.vmap(lambda atoms_of_mode: atoms_of_mode.moments())(atoms)
     return ReceivedByMode(
         z=z,

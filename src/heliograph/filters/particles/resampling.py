@@ -1,7 +1,7 @@
 """Random numbers of particles: resampling of weighted ones, their normal numbers, and keys that depend on the data."""
 
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,10 @@ MANY = 10_000  # normal numbers, more than a program of native code draws at onc
 
 
 def invert_distribution(law: jax.Array, uniform: jax.Array) -> jax.Array:
-    """Return the index at which the distribution function of a law passes a uniform number: a draw from the law."""
+    """Return the index at which the distribution function of a law passes a uniform number: a draw from the law.
+
+    `law` (N,) are probabilities; `uniform` is a number of [0, 1), or an array of several, which give as many indices.
+    """
     return jnp.searchsorted(jnp.cumsum(law)[:-1], uniform).astype(int)
 
 
@@ -99,17 +102,28 @@ def fold_in_bits(key: jax.Array, z: jax.Array) -> jax.Array:
     return key
 
 
-def draw_keys_of_rows(filter: Any, z: Array, key: Array | None) -> tuple[jax.Array, ...]:
-    """Return the random keys of rows of data, and uniform numbers, which depend on the data but on no particle.
+class KeysOfRows(NamedTuple):
+    """Random keys and numbers with which a particle filter goes over rows of data.
+
+    start: key by which x_0 is drawn. choice_starts (rows,): the uniform number at which each row's systematic
+    resampling starts. last: key after the last row. noises, proposals (rows, ...): keys of each row's process noise,
+    and of its draws that use z.
+    """
+
+    start: jax.Array
+    choice_starts: jax.Array
+    last: jax.Array
+    noises: jax.Array
+    proposals: jax.Array
+
+
+def draw_keys_of_rows(filter: Any, z: Array, key: Array | None) -> KeysOfRows:
+    """Draw the random keys of all rows of data at once: they depend on the data, and on no particle.
 
     Args:
-        filter: the filter.
+        filter: a particle filter, which says how a key leads to the next ones.
         z: measurements (rows, received), on which keys depend.
         key: key of the state before the rows; None for the start before any data.
-
-    Returns:
-        Key of x_0; uniform numbers with which resampling starts (rows,); the key after the last row; keys of noises,
-        and of proposals (rows, ...).
     """
 
     def draw(key: jax.Array, row: jax.Array) -> tuple[jax.Array, tuple[jax.Array, ...]]:
@@ -122,7 +136,9 @@ def draw_keys_of_rows(filter: Any, z: Array, key: Array | None) -> tuple[jax.Arr
     last_key, (choice_starts, noise_keys, proposal_keys) = jax.lax.scan(
         draw, first_key if key is None else jnp.asarray(key), jnp.asarray(z)
     )
-    return start_key, choice_starts, last_key, noise_keys, proposal_keys
+    return KeysOfRows(
+        start=start_key, choice_starts=choice_starts, last=last_key, noises=noise_keys, proposals=proposal_keys
+    )
 
 
 draw_keys_of_rows_by_xla = quickly_compiled(draw_keys_of_rows)

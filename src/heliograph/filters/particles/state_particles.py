@@ -1,6 +1,6 @@
 """Particle filter of the state: weighted points for any plant, and any sensor and link whose noise has a density."""
 
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,12 +12,13 @@ from heliograph.factors.pivots import square_root
 from heliograph.filters.base import Step, corrects, estimates, make_sizes, predicts
 from heliograph.filters.particles.base import (
     AbstractStateParticleFilter,
+    Expectations,
     WeighedParticles,
     relative_to_largest,
     update_if_used,
 )
-from heliograph.filters.particles.expected_measurement import ExpectedMeasurement
-from heliograph.filters.particles.moments import FirstSums, StateSums, first_sums, second_sums
+from heliograph.filters.particles.expected_measurement import ExpectedMeasurement, InnovationSums
+from heliograph.filters.particles.moments import StateSums, first_sums, second_sums
 from heliograph.filters.particles.proposal import MoveLaw, factor_noise_covariance, propose_particles
 from heliograph.filters.particles.received_density import ReceivedAtoms, find_received_density
 from heliograph.filters.particles.resampling import draw_normals, effective_number, fold_in_bits
@@ -75,18 +76,18 @@ class StateParticleFilter(AbstractStateParticleFilter):
     uses_empty_rows = False
 
     def allocate_particles(self, count: int) -> np.ndarray:
-        """Return an array of so many positions."""
+        """Return an array for the positions of `count` particles (count, n), to be filled."""
         return np.zeros((count, len(self.states)))
 
     def get_particles(self, state: StateParticles) -> jax.Array:
-        """Return the positions (N, n) of a state."""
+        """Return the positions (N, n) of the particles: all that a particle of this filter is."""
         return state.position
 
     @compile_on_call
     def init(self) -> StateParticles:
-        """Draw the particles from the law of x_0.
+        """Draw the particles from the law of x_0, with equal weights (log weights of 0).
 
-        All log weights are 0. `moved` is False until a step is predicted.
+        `moved` is False until a step is predicted.
         """
         key, start_key = self.start_keys()
         x = self.draw_start(start_key, jnp.arange(self.particles))
@@ -100,11 +101,6 @@ class StateParticleFilter(AbstractStateParticleFilter):
         n = position.shape[1]
         law = MoveLaw(position, jnp.zeros((n, n)), jnp.zeros_like(position)) if self.optimal else None
         return StateParticles(position=position, log_weight=log_weight, law=law, key=key, moved=jnp.asarray(True))
-
-    def start_keys(self) -> tuple[jax.Array, jax.Array]:
-        """Return the key of the first step, and that of the draws of x_0."""
-        key, start_key = jax.random.split(jax.random.PRNGKey(self.seed))
-        return key, start_key
 
     def draw_start(self, key: jax.Array, numbers: jax.Array) -> jax.Array:
         """Draw x_0 (B, n) of the particles of these numbers.
@@ -247,46 +243,65 @@ class StateParticleFilter(AbstractStateParticleFilter):
         return atoms
 
     def sum_received(
-        self, reference: tuple[Any, ...], weight: jax.Array, predicted: tuple[Any, ...], z: jax.Array, k: Step
-    ) -> tuple[FirstSums, jax.Array]:
-        """Return first and second sums of the innovations of B particles and atoms, less a reference innovation.
+        self, reference: Expectations, weight: jax.Array, predicted: Expectations, z: jax.Array, k: Step
+    ) -> InnovationSums:
+        """Return weighted sums of the innovations d of z, and of d d', over B particles and the Gaussians of each.
 
-        Atoms are the Gaussians whose mixture is the law of z given y = h(x). `predicted` holds y of the particles, and
-        `reference` y of the heaviest one, whose innovation under the first atom is subtracted, so that no digits are
-        lost if z is far from 0.
+        Given y = h(x), z is a mixture of Gaussians (atoms): a particle has an innovation z - E[z | y, atom] for each.
+        That of the reference particle under the first atom is subtracted from all, so that no digits are lost if z is
+        far from 0.
+
+        Args:
+            reference: one array, y (p,) of the heaviest particle.
+            weight: of the particles before z is known (B,).
+            predicted: one array, y of all particles (B, p).
+            z: measurement (m,), NaN for what did not arrive.
+            k: step.
         """
-        expected = ExpectedMeasurement(self.find_received_atoms(z, k), z, reference[0], self.observed_angles)
-        joint_weight, difference = expected.find_innovations(weight, *predicted)
-        return first_sums(joint_weight, difference, angles=()), second_sums(joint_weight, difference)
+        (y_of_reference,), (y,) = reference, predicted
+        expected = ExpectedMeasurement(self.find_received_atoms(z, k), z, y_of_reference, self.observed_angles)
+        joint_weight, difference = expected.find_innovations(weight, y)
+        return InnovationSums(
+            first=first_sums(joint_weight, difference, angles=()), second=second_sums(joint_weight, difference)
+        )
 
     def innovation_from_sums(
-        self,
-        received: tuple[FirstSums, jax.Array],
-        reference: tuple[Any, ...],
-        z: jax.Array,
-        k: Step,
-        density: jax.Array,
+        self, received: InnovationSums, reference: Expectations, z: jax.Array, k: Step, density: jax.Array
     ) -> Innovation:
-        """Return z - E z over particles and atoms, the covariance of z, and the log-likelihood.
+        """Return the innovation z - E z, its covariance Cov z, and log p(z).
 
-        Atoms are the Gaussians whose mixture is the law of z given h(x). `received` holds first and second sums of
-        innovations less that of the `reference`, h(x) of the heaviest particle. `density` is log p(z).
+        Args:
+            received: sums over all particles, and over the Gaussians whose mixture is the law of z given y = h(x), of
+                their innovations less the one of the reference particle.
+            reference: one array, y (p,) of the reference particle, which gives the innovation that was subtracted.
+            z: measurement (m,), NaN for what did not arrive.
+            k: step.
+            density: log p(z), found by the weights, and put into the result.
         """
-        first_sums_of_innovations, second_sums_of_innovations = received
-        expected = ExpectedMeasurement(self.find_received_atoms(z, k), z, reference[0], self.observed_angles)
-        return expected.compute_innovation(first_sums_of_innovations, second_sums_of_innovations, density)
+        (y_of_reference,) = reference
+        expected = ExpectedMeasurement(self.find_received_atoms(z, k), z, y_of_reference, self.observed_angles)
+        return expected.compute_innovation(received, density)
 
     def sum_for_mean(self, weight: jax.Array, position: jax.Array) -> StateSums:
-        """Return the first sums of positions (B, n)."""
+        """Return sums over B particles of weights, their squares, weighted positions (n,), and sines of angles.
+
+        From those over all particles the mean follows. There are no modes (None).
+        """
         return StateSums(first_sums(weight, position, first(self.plant).angles), None)
 
     def sum_for_covariance(self, weight: jax.Array, position: jax.Array, sums: StateSums) -> jax.Array:
-        """Return the second sums (n, n) of positions (B, n) about the mean of all."""
+        """Return sum_i w_i (x_i - mean)(x_i - mean)' (n, n) over B particles, about the mean of all particles.
+
+        `sums` are those over all particles, by `sum_for_mean`; differences of angles are taken within half a turn.
+        """
         angles = first(self.plant).angles
         return second_sums(weight, wrap_angles(position - sums.first.mean(angles), angles))
 
     def estimate_from_sums(self, sums: StateSums, second: jax.Array) -> Estimate:
-        """Return the weighted mean and covariance; of an angle its mean direction, and second moments about it."""
+        """Return the weighted mean and covariance; of an angle its mean direction, and second moments about it.
+
+        `second` is the sum of w d d' (n, n) over all particles, with the weight w and the difference d from the mean.
+        """
         return Estimate(sums.first.mean(first(self.plant).angles), second / sums.first.weight, self.claim)
 
     @estimates
@@ -296,9 +311,9 @@ class StateParticleFilter(AbstractStateParticleFilter):
 
 
 def _find_square_root(columns: WeightedColumns) -> jax.Array:
-    """Return a square root (n, n) of a covariance given by its columns."""
-    triangular = triangularise(columns)
-    return jnp.asarray(triangular.matrix * square_root(triangular.weights))
+    """Return a square root G (n, n) of a covariance W diag(w) W' given by its columns: G G' = W diag(w) W'."""
+    factors = triangularise(columns)  # L and d of the same covariance L diag(d) L', so that G = L sqrt(d)
+    return jnp.asarray(factors.matrix * square_root(factors.weights))
 
 
 def build_state_particles(
@@ -350,7 +365,10 @@ def build_state_particles(
 
 
 def _check_gaussian(plant: AbstractPlant) -> None:
-    """Raise ValueError unless the process noise is Gaussian."""
+    """Raise ValueError unless the process noise is Gaussian, as the optimal proposal needs.
+
+    A noise that is no law but a covariance depending on inputs counts as Gaussian.
+    """
     if isinstance(plant.noise, AbstractNoise) and not isinstance(plant.noise, Gaussian):
         expected = "Gaussian process noise (proposal='prior' takes any)"
         raise fail("particle_filter with the optimal proposal", expected, type(plant.noise).__name__)

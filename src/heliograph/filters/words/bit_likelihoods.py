@@ -41,20 +41,33 @@ class LinkOfBits(Module):
     flag: int | None = eqx.field(static=True)
 
     def find_probabilities(self, z: jax.Array) -> Float[jax.Array, " combinations"]:
-        """Return the probability of each combination of bit error rates, given the mode that z[flag] reports.
+        """Return the probability of each combination of bit error rates, given the mode of the channel.
 
-        `self.flag` is the output that reports the mode, or None without modes. `self.weights` (modes, combinations) are
-        the probabilities in each mode. If z[flag] is NaN, all modes are equally likely.
+        The error rates of the channel's links are random: a combination is one possible value of each, and `links` has
+        the channel with it. Their probabilities depend on the mode, whose number comes in the output z[flag].
+
+        Args:
+            z: what all outputs of the channel delivered at one step. If the mode did not arrive (NaN), all modes count
+                as equally likely.
         """
-        weights = jnp.asarray(self.weights)
-        if self.flag is None:
+        weights = jnp.asarray(self.weights)  # P(combination | mode), (modes, combinations)
+        if self.flag is None:  # no modes: one row
             return weights[0]
         mode = z[self.flag]
+        # 1 for the reported mode and 0 for the others.
         mode_probabilities = jnp.where(jnp.isnan(mode), 1 / len(weights), mode == np.arange(len(weights)))
         return mode_probabilities @ weights
 
     def find_sent_likelihoods(self, received: Pairs) -> list[Pairs]:
-        """Return for each combination what the received bits say of those that were sent, (components, bits, 2)."""
+        """Return P(received | sent bit is 0) and P(received | it is 1) of each sent bit, by combination of error rates.
+
+        Args:
+            received: P(what came | received bit is 0), and is 1, of each received bit (words, bits, 2): 1 and 0 for a
+                bit that came as 0, 1 and 1 for one that did not come.
+
+        Returns:
+            An array (components of y, bits, 2) for each combination.
+        """
         return [infer_sent_bits(link, received) for link in self.links]
 
 
@@ -78,7 +91,7 @@ def make_link_of_bits(channel: AbstractRandomAffine) -> LinkOfBits:
         weights = np.array([[probability for probability, _ in mixture]], dtype=float)
         return LinkOfBits(links=tuple(link for _, link in mixture), weights=weights, flag=None)
     # A channel with modes, whose number is received with the codewords: the channel in each mode.
-    link_by_mode = list_told_modes(channel)
+    link_by_mode = list_links_by_reported_mode(channel)
     if not link_by_mode:
         expected = "one without memory, or with modes of one chain that are told last: hg.model.with_flag(link)"
         raise fail("channel of a word filter", expected, "modes that are not told")
@@ -93,7 +106,7 @@ def make_link_of_bits(channel: AbstractRandomAffine) -> LinkOfBits:
     return LinkOfBits(links=tuple(links), weights=weights, flag=channel.outputs - 1)  # the last output is the mode
 
 
-def list_told_modes(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]:
+def list_links_by_reported_mode(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]:
     """Return the channel of codewords in each mode of its chain, without the output that reports the mode.
 
     A channel may report the mode of its only Markov chain with each message: its last output is then a `ModeOutput`,
@@ -111,16 +124,13 @@ def list_told_modes(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]
 
 
 def _list_modes(link: AbstractRandomAffine) -> list[Modes]:
-    """Return all maps with modes inside a link, itself included."""
+    """Return all parts of a link whose law depends on a mode of a Markov chain; the link itself may be one."""
     inside = [mode for inner in inner_maps(link) for mode in _list_modes(inner)]
     return [link, *inside] if isinstance(link, Modes) else inside
 
 
 def _fix_mode(link: AbstractRandomAffine, mode: int) -> AbstractRandomAffine:
-    """Return a map in one mode of its chain.
-
-    In a link that has no modes itself, the links inside it are fixed.
-    """
+    """Return the link as it is while its Markov chain is in one mode: every part with modes has that mode's law."""
     if isinstance(link, Modes):
         return link.given(mode)
     return replace_inner_maps(link, [_fix_mode(inner, mode) for inner in inner_maps(link)])
@@ -185,7 +195,7 @@ def infer_sent_bits(link: AbstractRandomAffine, received: Pairs) -> Pairs:
 
 
 def _multiply_likelihoods(factors: Sequence[jax.Array], shape: tuple[int, ...]) -> jax.Array:
-    """Return the product of all factors entry by entry, or ones of this shape if there are no factors."""
+    """Return the product of all factors entry by entry; of no factors, as of a bit that nobody received, ones."""
     product = jnp.ones(shape) if not factors else factors[0]
     for factor in factors[1:]:
         product = product * factor
@@ -193,11 +203,11 @@ def _multiply_likelihoods(factors: Sequence[jax.Array], shape: tuple[int, ...]) 
 
 
 def is_free_of_flips(link: LinkOfBits) -> bool:
-    """Test whether no bit is ever flipped."""
+    """Return whether no bit is ever flipped: every error rate inside is 0, in all combinations of error rates."""
     return all(float(flips.error.moment(1)) == 0 for law in link.links for flips in _list_flips(law))
 
 
 def _list_flips(link: AbstractRandomAffine) -> list[Flips]:
-    """Return all flips inside a link, itself included."""
+    """Return all parts of a link that flip bits (`Flips`); the link itself may be one."""
     inside = [flips for inner in inner_maps(link) for flips in _list_flips(inner)]
     return [link, *inside] if isinstance(link, Flips) else inside

@@ -30,7 +30,11 @@ from heliograph.random_affine.words.rounding_noise import RoundedNoise, find_rou
 
 
 class WordAlphabet(NamedTuple):
-    """The codewords of each component: the lowest (or any one), step and centre (m,), bits (0 without end), dither."""
+    """The codewords that stand for each of m components: low + i step, i = 0, 1, ..., 2^bits - 1.
+
+    `centre` (m,) is the middle of their range. `bits` is 0 for codewords without end, of which `low` is any one.
+    `dither` is the kind of random number that the sender adds before it rounds.
+    """
 
     low: np.ndarray
     step: np.ndarray
@@ -59,11 +63,15 @@ def _alphabet_of(sensor: AbstractSensor, encoder: Words | None) -> WordAlphabet:
 
 
 def _take_off_rounding(sensor: AbstractSensor) -> AbstractSensor:
-    """Return the sensor with the noise that it has before it rounds: without the error of rounding."""
+    """Return the sensor without the error of rounding: with the noise that it has before it rounds its outputs.
+
+    A filter that knows which codeword came treats the rounding itself, not as noise.
+    """
     if not isinstance(sensor.noise, RoundedNoise):
         return sensor
     unrounded = copy(sensor)
-    object.__setattr__(unrounded, "noise", sensor.noise.source)  # fields are frozen
+    # Past the check that fields of a built object are not assigned.
+    object.__setattr__(unrounded, "noise", sensor.noise.source)
     return unrounded
 
 
@@ -99,8 +107,8 @@ def word_filter(
     far off for tens of steps.
 
     One word over several paths is used as one: the bits of all that came are weighed together. Error rates that are
-    drawn are averaged over. Modes that are told with each message (`hg.model.with_flag`) have their own rates. Words
-    that are late by a constant delay are used for the past, which is predicted to the present.
+    drawn are averaged over. Modes that are reported with each message (`hg.model.with_flag`) have their own rates.
+    Words that are late by a constant delay are used for the past, which is predicted to the present.
 
     Args:
         plant: linear or not; n states.
@@ -115,7 +123,7 @@ def word_filter(
 
     Raises:
         ValueError: parts that do not fit, angles, neither encoder nor resolution or both, a channel that is late by
-            chance, modes that are not told, words without end behind more than losses.
+            chance, modes that are not reported, words without end behind more than losses.
 
     Source: Curry, Estimation and control with quantized measurements (1970), the Gaussian fit, for any word channel.
     """

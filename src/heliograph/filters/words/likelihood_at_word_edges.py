@@ -71,7 +71,7 @@ def tail_and_density(a: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def signed_tail_and_density(a: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return Q(a) and phi(a) of any a."""
+    """Return the normal tail Q(a) = P(t > a) and the density phi(a) of any a, negative ones too: Q(a) = 1 - Q(-a)."""
     q, density = tail_and_density(jnp.abs(a))
     return jnp.where(a < 0, 1 - q, q), density
 

@@ -14,7 +14,7 @@ from heliograph.filters.base import (
     make_sizes,
 )
 from heliograph.filters.smoother_step import SmootherStep, StepTrace
-from heliograph.filters.words.bit_likelihoods import list_told_modes
+from heliograph.filters.words.bit_likelihoods import list_links_by_reported_mode
 from heliograph.filters.words.overload import Overload, bound_overload, refuse_overload
 from heliograph.filters.wrappers.wrapper import AbstractWrapper
 from heliograph.model.channel import Channel, check_sent
@@ -72,7 +72,7 @@ class LinearWordsFilter(AbstractWrapper):
         return corrected, Innovation(value, covariance, innovation.log_likelihood)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
-        """Return the smoother step of the filter of the numbers."""
+        """Return what a backward pass needs of a step: the base filter's, with the codewords in z as its numbers."""
         return self.base.smoother_step(step._replace(z=self._convert_words_to_numbers(jnp.asarray(step.z))))
 
     def _convert_words_to_numbers(self, z: jax.Array) -> jax.Array:
@@ -119,7 +119,7 @@ def build_behind_words(
     check_sent(first(sensor), first(channel))
     indices, numbers = find_carried_components(channel), rewrite_about_centres(encoder, channel)
     # The channel of codewords as numbers, z = G (y - c) + n: in each mode if modes are reported, else at each step.
-    channel_by_mode = [rewrite_about_centres(encoder, link) for link in list_told_modes(first(channel))]
+    channel_by_mode = [rewrite_about_centres(encoder, link) for link in list_links_by_reported_mode(first(channel))]
     channels = [first(link) for link in channel_by_mode or unstack(numbers)]
     # Whether G is random given the reported mode, as it is if bits flip.
     remembers = first(channel).remembers
@@ -164,7 +164,11 @@ def _check_rounding(sensor: AnySensor, encoder: Words, fades_with_memory: bool) 
 
 
 def _claim_despite_overload(overload: Overload) -> Claim:
-    """Return "exact" where overload changes the rms error by 1 % at most, else "nominal"."""
+    """Return "exact" where overload changes the rms error by at most SEEN (1 %), else "nominal".
+
+    A codeword is overloaded if y lies beyond the range that it can stand for. Where that change has no known bound, it
+    is NaN, and the claim "nominal".
+    """
     return "exact" if float(np.max(overload.bound, initial=0.0)) <= SEEN else "nominal"
 
 

@@ -163,7 +163,7 @@ def _describe_system(
 
 
 def _list_links(numbers: Channel, horizon: int) -> list[SecondOrder]:
-    """Return mean and covariance of gain and noise of the channel at each step."""
+    """Return the moments of gain and noise of the channel z = G y + n at each of `horizon` steps."""
     links = [second_order(link) for link in unstack(numbers)]
     return links if len(links) > 1 else links * horizon
 
@@ -171,9 +171,9 @@ def _list_links(numbers: Channel, horizon: int) -> list[SecondOrder]:
 def _find_models_of_step(
     plant: AnyPlant, sensor: AnySensor, links: list[SecondOrder] | None, k: int
 ) -> tuple[Motion, Sensing, SecondOrder | None]:
-    """Return the motion, the sensing and the link at step k.
+    """Return the matrices of plant and sensor at step k, and the moments of the link.
 
-    `links` holds the link's moments at each step, or is None if there is no link.
+    `links` holds the link's moments at each step; None where they are not needed, and then the third result is None.
     """
     link = None if links is None else links[k]
     return _find_motion(at(plant, k)), _find_sensing(at(sensor, k)), link
@@ -181,14 +181,14 @@ def _find_models_of_step(
 
 @cache_by_object
 def _find_motion(plant: LinearPlant) -> Motion:
-    """Return A, b and Cov w with inputs zero."""
+    """Return A, b and Cov w of a plant x+ = A x + b + w whose inputs are zero, as NumPy arrays."""
     matrix, offset, covariance = _evaluate_motion(plant)
     return Motion(matrix=np.asarray(matrix), offset=np.asarray(offset), covariance=np.asarray(covariance))
 
 
 @compile_on_call
 def _evaluate_motion(plant: LinearPlant) -> tuple[Array, Array, Array]:
-    """Return A, b and Cov w with inputs zero, by one program."""
+    """Return A, b and Cov w of a plant whose inputs are zero, computed by one compiled program."""
     u = jnp.zeros(len(plant.inputs))
     return plant.transition_matrix(u), plant.shift(u), plant.noise_covariance(u)
 
@@ -212,26 +212,34 @@ def _find_sensing(sensor: LinearSensor) -> Sensing:
 
 
 def _describe_step(motion: Motion, sensing: Sensing, link: SecondOrder, mean: np.ndarray, second: np.ndarray) -> Steps:
-    """Return one step of the linear system x+ = A x + b + w, z = E[G] (y - c) + E n + noise.
+    """Return the matrices of one step of the linear system x+ = A x + b + w, z = E[G] C x + offset + noise.
 
-    The signal is y - c = C x + offset + v about the centre c of the codewords, r the error of rounding it, and the link
-    is z = G s + n for s = y - c + r. `mean` (outputs,) and `second` (outputs, outputs) are E s and E[s s'] before any
-    data.
+    The sensor's signal about the centre c of the codewords is y - c = C x + offset + v. It is rounded with the error r,
+    and the link makes z = G s + n of s = y - c + r. So the noise is E[G] (v + r) + (G - E G) s + (n - E n): what is
+    random in G acts on all of s, of which E[s s'] is needed, not only its covariance.
+
+    Args:
+        motion: A, b and Cov w.
+        sensing: C, offset, Cov v and Cov r.
+        link: moments of G and n.
+        mean: E s before any data (outputs,).
+        second: E[s s'] before any data (outputs, outputs).
     """
-    # A random gain acts as noise: Cov noise = E[G] Cov(v + r) E[G]' + Cov n + sum_kl Cov(G_ik, G_jl) E[(s, 1)(s,
-    # 1)']_kl.
-    moments = np.block([[second, mean[:, None]], [mean[None], np.ones((1, 1))]])  # E[(s, 1)(s, 1)']
-    gain, gain_noise = np.asarray(link.mean_gain), np.einsum("ijkl,kl->ij", np.asarray(link.gain_covariance), moments)
-    columns = np.asarray(link.noise.matrix)
-    covariance = sensing.covariance + sensing.rounding
-    noise = gain @ covariance @ gain.T + (columns * np.asarray(link.noise.weights)) @ columns.T
+    gain = np.asarray(link.mean_gain)  # E[G]
+    sensed = gain @ (sensing.covariance + sensing.rounding) @ gain.T  # Cov(E[G] (v + r))
+    columns, weights = np.asarray(link.noise.matrix), np.asarray(link.noise.weights)
+    of_link = (columns * weights) @ columns.T  # Cov n
+    # Cov((G - E G) s)_ij = sum_kl Cov(G_ik, G_jl) E[s_k s_l]; the index -1 of k and l is that of a 1 below s, whose
+    # factor is n, which may be correlated with G.
+    second_with_one = np.block([[second, mean[:, None]], [mean[None], np.ones((1, 1))]])  # E[(s, 1)(s, 1)']
+    of_random_gain = np.einsum("ijkl,kl->ij", np.asarray(link.gain_covariance), second_with_one)
     return Steps(
         transition=motion.matrix,
         drift=motion.offset,
         process=motion.covariance,
         output=gain @ sensing.matrix,
         offset=gain @ sensing.offset + np.asarray(link.offset),
-        noise=noise + gain_noise,
+        noise=(sensed + of_link) + of_random_gain,
     )
 
 
@@ -295,8 +303,9 @@ def _bound_error(
     terms = np.zeros((0, n, len(indices)))  # ((I - K H) A)^j K s, a row of (n, outputs) for each j
     for k in range(system.horizon):
         # s = sqrt(E g^2) (rms excess), with the link's gain g at each output.
-        second_moment = np.asarray(links[k].power.center)
-        rms_gain = np.sqrt(np.maximum(np.einsum("iikk->i", second_moment[..., :-1, :-1]), 0.0))
+        # `power` has E[G_ia G_jb] at [i, j, a, b]; the last a and b are those of a constant 1 below the signal.
+        second_moments_of_gain = np.asarray(links[k].power.center)[..., :-1, :-1]
+        rms_gain = np.sqrt(np.maximum(np.einsum("iikk->i", second_moments_of_gain), 0.0))
         newest = gains.gain[k] * (rms_gain * rms_excess[k][list(indices)])
         # Earlier terms move by (I - K H) A. Those that have become rounding are left out.
         is_used = np.abs(terms).max(axis=(1, 2), initial=0.0) > 1e-12 * np.abs(newest).max()

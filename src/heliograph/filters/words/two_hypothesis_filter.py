@@ -34,7 +34,11 @@ SURE = 1e-10  # share of a word's probability below which that of its leading bi
 
 
 class Hypotheses(NamedTuple):
-    """Two Gaussians of the state (2, n), and the probabilities (2,) that the last words were right, and not."""
+    """The law of the state as a mixture of two Gaussians (2, n) with probabilities (2,).
+
+    The first is the law if the leading bits of the last message's codewords were all right, the second if they were
+    not.
+    """
 
     parts: Gaussian
     weights: Float[jax.Array, "2"]
@@ -56,7 +60,7 @@ class TwoHypothesesFilter(AbstractSizedFilter):
     base: WordFilter
 
     def angles_used(self) -> FilterAngles:
-        """Return the angles of its plant."""
+        """Return the indices of states that are angles, as the filter with one Gaussian has them."""
         return self.base.angles_used()
 
     @property
@@ -66,7 +70,7 @@ class TwoHypothesesFilter(AbstractSizedFilter):
 
     @compile_on_call
     def init(self) -> Hypotheses:
-        """Return the prior twice, the first with all of the probability."""
+        """Return the prior as both Gaussians, the first with all of the probability: no codeword came yet."""
         start = self.base.init()
         return Hypotheses(jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), start), jnp.array([1.0, 0.0]))
 
@@ -89,7 +93,7 @@ class TwoHypothesesFilter(AbstractSizedFilter):
         Gaussians: the leading bits of the last codewords were right, or not. Each codeword splits both hypotheses, by
         whether its leading bits are right, and the four Gaussians are merged to two.
         """
-        # Which codewords arrived, and for each received bit its probabilities if 0 or 1 was sent.
+        # `words`: which codeword of each component arrived, and for each of its bits P(received | 0 or 1 was sent).
         base, z, n = self.base, jnp.asarray(z), len(self.states)
         words = base.identify_received_words(z, at(base.links, k))
 
@@ -115,12 +119,12 @@ class TwoHypothesesFilter(AbstractSizedFilter):
 
     @estimates
     def estimate(self, state: Hypotheses) -> Estimate:
-        """Return the mean and covariance of the mixture."""
+        """Return the mean and covariance of the mixture of both Gaussians, angles between -pi and pi."""
         mean, covariance = moments_of_mixture(state.parts.mean, state.parts.covariance, state.weights)
         return Estimate(wrap_angles(mean, first(self.base.plant).angles), covariance, self.claim)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
-        """Return the smoother step of one Gaussian of the mixture's moments."""
+        """Return what a backward pass needs of a step, with both Gaussians merged to one before and after it."""
         return smoother_step_by_transform(self.base, step.map_states(_merge_hypotheses), self.base)
 
     def _split_by_answer(self, hypothesis: Gaussian, i: int, words: ReceivedWords) -> tuple[Gaussian, jax.Array]:
@@ -147,7 +151,10 @@ class TwoHypothesesFilter(AbstractSizedFilter):
     def _split_and_merge(
         self, joint: Hypotheses, i: int, words: ReceivedWords, some_word_was_used: jax.Array
     ) -> tuple[Hypotheses, jax.Array]:
-        """Condition both hypotheses on codeword i being right, or not; merge the four by whether all words were right.
+        """Condition both Gaussians on codeword i in two cases: its leading bits are right, or not; merge four to two.
+
+        The new first Gaussian is that in which all codewords of the message so far were right, the second any other.
+        It is about one message alone: its first codeword forgets whether those of the message before were right.
 
         Args:
             joint: the two Gaussians of (x, y), and their probabilities: the leading bits of all codewords of the
@@ -160,14 +167,15 @@ class TwoHypothesesFilter(AbstractSizedFilter):
             The hypotheses given codeword i, unchanged if it did not arrive, and the codeword's probability.
         """
         # Four Gaussians [h, a] and their probabilities (2, 2): h = 0 or 1 is the hypothesis so far, and a = 0 if the
-        # leading bits of codeword i are right, 1 if not. P[h, a] = P(h) P(a, codeword i | h).
+        # leading bits of codeword i are right, 1 if not. P[h, a] = P(h) P(codeword i, a | h).
         gaussians, probability = jax.lax.map(lambda x: self._split_by_answer(x, i, words), joint.parts)
         probability = probability * joint.weights[:, None]
         total = jnp.sum(probability)
         # all_right[h, a]: codeword i is right (a = 0), and so are those before it in this message (h = 0). At the first
         # codeword of a message h is about the message before, so that a = 0 alone decides.
-        all_right = jnp.array([[True, False], [True, False]])
-        all_right = all_right & jnp.stack([jnp.asarray(True), ~some_word_was_used])[:, None]
+        this_is_right = jnp.array([[True, False], [True, False]])
+        those_before_are_right = jnp.stack([jnp.asarray(True), ~some_word_was_used])  # by h
+        all_right = this_is_right & those_before_are_right[:, None]
         four_gaussians = jax.tree.map(lambda leaf: leaf.reshape(4, *leaf.shape[2:]), gaussians)
 
         def merge_chosen(chosen: jax.Array) -> tuple[Gaussian, jax.Array]:
@@ -190,10 +198,10 @@ class TwoHypothesesFilter(AbstractSizedFilter):
 
 
 def _merge_hypotheses(state: Hypotheses) -> Gaussian:
-    """Return one Gaussian of the mixture's mean and covariance."""
-    return merge_mixture(*state)
+    """Return one Gaussian with the mean and covariance of the mixture of both hypotheses."""
+    return merge_mixture(state.parts, state.weights)
 
 
 def make_two_hypotheses_filter(base: WordFilter) -> TwoHypothesesFilter:
-    """Return the filter of two hypotheses that uses the moments of one."""
+    """Return the filter that carries two Gaussians, from the one with a single Gaussian, whose updates it uses."""
     return TwoHypothesesFilter(base=base, **make_sizes(base.claim, first(base.plant), base.received))

@@ -66,7 +66,11 @@ class WordFilter(AbstractGaussianStateFilter):
 
     @corrects
     def correct(self, state: Gaussian, z: ArrayLike, k: Step = 0) -> tuple[Gaussian, Innovation]:
-        """Correct with the codewords that arrived, one component of y after another in the joint Gaussian of (x, y)."""
+        """Correct with the codewords that arrived, one component of y after another in the joint Gaussian of (x, y).
+
+        Component y_i gets its exact mean and variance given its codeword; x and the other components follow by their
+        regression on y_i.
+        """
         z, n = jnp.asarray(z), len(self.states)
         signal = self.predict_signal(state, k)
         noise = triangularise_noise(join_columns(signal.noise, rounding_of(signal.size)))
@@ -93,7 +97,7 @@ class WordFilter(AbstractGaussianStateFilter):
         return True
 
     def predict_signal(self, state: Gaussian, k: Step) -> Signal:
-        """Return the moments of y before it is rounded."""
+        """Return the moments of the sensor's signal y = h(x) + v before it is rounded, for the predicted x."""
         plant, sensor = at(self.plant, k), at(self.sensor, k)
         return find_signal_moments(plant, sensor, self.transform, state, second_moments_at_start(self.plant, self))
 
@@ -124,7 +128,7 @@ class WordFilter(AbstractGaussianStateFilter):
         first_copies = []
         for i in range(len(self.low)):
             copies = np.flatnonzero(component == i)
-            first_copies.append(_pick_first_copy([(arrived[j], number[j], dither[j]) for j in copies]))
+            first_copies.append(_pick_first_copy([WordCopy(arrived[j], number[j], dither[j]) for j in copies]))
         present, numbers, dithers = (jnp.stack(values) for values in zip(*first_copies, strict=True))
         # P(received | sent 0) and P(received | sent 1) of each bit, under each possible set of error rates of the link,
         # and the probabilities of these sets.
@@ -144,7 +148,10 @@ class WordFilter(AbstractGaussianStateFilter):
         )
 
     def find_signal_prior(self, joint: Gaussian, i: int) -> SignalPrior:
-        """Return mean and deviation of y_i, from the joint Gaussian of the state x and the signal y."""
+        """Return mean and standard deviation of y_i, from the joint Gaussian of (x, y), mean + L xi.
+
+        Its row behind the n states of x is that of y_i, so that Var y_i is the sum of (row_j)^2 Var xi_j.
+        """
         index = len(self.states) + i
         return SignalPrior(joint.mean[index], jnp.sqrt(joint.root[index] ** 2 @ joint.variances))
 
@@ -197,39 +204,42 @@ class WordFilter(AbstractGaussianStateFilter):
         return find_effect_of_bits(pairs, words.weights, words.numbers[i], grid, prior, self.dither)
 
     def _word_grid(self, i: int, words: "ReceivedWords") -> WordGrid:
-        """Return the codewords of y_i, less the known dither: the lowest one, the step between them, their bits."""
+        """Return the values that the codewords of y_i stand for: the lowest, the step between them, and their bits.
+
+        A dither that is known was added before rounding, so it is subtracted from them.
+        """
         return WordGrid(jnp.asarray(self.low)[i] - words.dithers[i], jnp.asarray(self.spacing)[i], self.bits)
 
     def compute_innovation(
         self, signal: Signal, words: "ReceivedWords", z: jax.Array, numbers: SecondOrder, log_likelihood: jax.Array
     ) -> Innovation:
-        """Return the innovation of the codewords as numbers about their centres; NaN for reported modes and dithers.
+        """Return the innovation of the received codewords, taken as numbers: q - c less what was expected of it.
 
-        A codeword is the quantised signal y in bits. As a number about the centre c of its range it is an affine
-        measurement of y with rounding noise, of which the usual innovation z - E z and its covariance are computed.
+        A codeword q stands for the signal y rounded to steps D, in a range about the centre c. As a number it is q - c
+        = g (y - c + d + r) + n with the error r of rounding, the sender's dither d, and a random gain g and noise n by
+        which flipped bits change numbers (all as vectors). So its innovation is q - c - E[g] d - E[g] E(y - c) - E n.
 
         Args:
             signal: mean, covariance and noise of y before it is rounded.
             words: what was received.
-            z: received codewords and reported modes, then the dithers that are subtracted.
-            numbers: mean and covariance of the random gain and offset by which the link changes codewords as numbers.
+            z: for each output of the channel a codeword q, or the number of the reported mode; then the dithers d of
+                the codewords, if they are subtracted.
+            numbers: moments of the gain G and noise n of all codewords as numbers, (words, components of y).
             log_likelihood: of the codewords.
+
+        Returns:
+            Value and covariance with an entry for each number in z: NaN for modes and dithers, which are given.
         """
-        # Moments of y - c, with the error of rounding as a noise.
-        rounding_variance = LARGEST[self.dither].error * jnp.asarray(self.spacing) ** 2
-        mean = signal.mean - jnp.asarray(self.centre)
-        noise = join_columns(signal.noise, WeightedColumns(np.eye(len(self.low)), rounding_variance))
-        second = signal.covariance + jnp.diag(rounding_variance) + jnp.outer(mean, mean)
-        about_centre = signal._replace(mean=mean, noise=noise, second=second)
+        about_centre = self._add_rounding_as_noise(signal)
         # Rows of z that are codewords (not the reported mode, FLAG), and the component of y in each.
         rows = np.array([i for i, index in enumerate(self.indices) if index != FLAG])
         component = np.array(self.indices)[rows]
         gain = jnp.asarray(numbers.mean_gain)
         values = z[rows] - jnp.asarray(self.centre)[component]
-        # Dithers that are subtracted pass the link's mean gain, as the words do.
-        dithers = jnp.sum(gain, axis=1) * z[len(self.indices) :] if len(z) > len(self.indices) else 0.0
-        # Innovation: value - dither - (gain mean + offset), and its covariance; NaN where nothing arrived.
-        value = values - dithers - (gain @ mean + jnp.asarray(numbers.offset))
+        # E[g] d. A codeword carries one component of y, so that its row of E[G] sums to its E[g].
+        has_dithers = len(z) > len(self.indices)
+        dithers = jnp.sum(gain, axis=1) * z[len(self.indices) :] if has_dithers else 0.0
+        value = values - dithers - (gain @ about_centre.mean + jnp.asarray(numbers.offset))
         covariance = innovation_covariance(about_centre, numbers)
         present = ~jnp.isnan(value)
         covariance = jnp.where(present[:, None] & present, covariance, jnp.nan)
@@ -239,6 +249,17 @@ class WordFilter(AbstractGaussianStateFilter):
             covariance=jnp.full((len(z), len(z)), jnp.nan).at[rows[:, None], rows].set(covariance),
             log_likelihood=log_likelihood,
         )
+
+    def _add_rounding_as_noise(self, signal: Signal) -> Signal:
+        """Return the moments of y - c, c the centre of the codewords, with the error of rounding y as one more noise.
+
+        For steps D its variance is a number of the dither's kind times D^2, the largest that it may have.
+        """
+        rounding_variance = LARGEST[self.dither].error * jnp.asarray(self.spacing) ** 2
+        mean = signal.mean - jnp.asarray(self.centre)
+        noise = join_columns(signal.noise, WeightedColumns(np.eye(len(self.low)), rounding_variance))
+        second = signal.covariance + jnp.diag(rounding_variance) + jnp.outer(mean, mean)
+        return signal._replace(mean=mean, noise=noise, second=second)
 
 
 class ReceivedWords(NamedTuple):
@@ -256,15 +277,22 @@ class ReceivedWords(NamedTuple):
     are_words: jax.Array
 
 
-def _pick_first_copy(copies: list[tuple[jax.Array, ...]]) -> tuple[jax.Array, ...]:
-    """Return presence, number and dither of the first copy that arrived, or False and zeros if none did.
+class WordCopy(NamedTuple):
+    """One copy of a codeword, as it came over one path: whether it arrived, its number and its dither, all ()."""
 
-    Each copy is a tuple of these three. The loop goes from the last copy to the first, so that the first one that
-    arrived overwrites all others.
+    arrived: jax.Array
+    number: jax.Array
+    dither: jax.Array
+
+
+def _pick_first_copy(copies: list[WordCopy]) -> WordCopy:
+    """Return the first copy of a codeword that arrived; one that did not, with zeros, if none did.
+
+    The loop goes from the last copy to the first, so that the first one that arrived overwrites all others.
     """
-    some_is_present, number, dither = jnp.asarray(False), jnp.zeros(()), jnp.zeros(())
-    for is_present, number_of_copy, dither_of_copy in reversed(copies):
-        some_is_present = is_present | some_is_present
-        number = jnp.where(is_present, number_of_copy, number)
-        dither = jnp.where(is_present, dither_of_copy, dither)
-    return some_is_present, number, dither
+    arrived, number, dither = jnp.asarray(False), jnp.zeros(()), jnp.zeros(())
+    for copy in reversed(copies):
+        arrived = copy.arrived | arrived
+        number = jnp.where(copy.arrived, copy.number, number)
+        dither = jnp.where(copy.arrived, copy.dither, dither)
+    return WordCopy(arrived, number, dither)

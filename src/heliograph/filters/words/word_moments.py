@@ -97,9 +97,10 @@ def sum_neighbouring_words(
     def add_block(
         carried: tuple[LikelihoodSums, jax.Array], block: jax.Array
     ) -> tuple[tuple[LikelihoodSums, jax.Array], None]:
-        """Add the sums over the upper edge of each codeword of one block.
+        """Add what the edges above each codeword of one block contribute: L jumps there to the next codeword's.
 
-        `carried`: the sums so far, and the likelihood of the block's high bits.
+        `carried`: the sums so far, and the likelihood of the block's high bits, with which the likelihood of each
+        codeword of the block is `high_bits @ tables`.
         """
         total, high_bits = carried
         high_bits_of_next = weigh_bits_above(block + 1)
@@ -126,8 +127,9 @@ def sum_words_near_prior(
 ) -> LikelihoodSums:
     """Return M = E L, E[t L] and E[t^2 L] over the codewords near the prior's mean, and the received one.
 
-    L is the likelihood of the codeword to which y is rounded, and t = (y - mean) / deviation. Beyond REACH (8.5)
-    deviations there is no probability, so it is enough to sum WINDOW blocks of 2^BLOCK codewords.
+    L is the likelihood of the codeword to which y is rounded: P(received | it was sent). t = (y - mean) / deviation.
+    Beyond REACH (8.5) deviations there is no probability, so it is enough to sum a window of WINDOW (10) blocks of
+    2^BLOCK (8) codewords; steps are so wide that it covers all deviations within the reach.
 
     Args:
         pairs: likelihoods of a zero and a one of each bit (bits, 2), for each combination of error rates.
@@ -288,17 +290,21 @@ def find_effect_of_bits(
     quarter) of a deviation; else groups of neighbouring codewords, since single ones would be too many.
 
     Args:
-        pairs: likelihoods of a zero and a one of each bit (bits, 2), for each combination of error rates.
+        pairs: P(received | the bit was sent as 0), and as 1, of each bit (bits, 2); an array for each combination of
+            the links' possible bit error rates.
         weights: probabilities of the combinations, (..., combinations) for several likelihoods at once.
         received: number of the received codeword.
         grid: the codewords: the lowest value, the step between values, and the number of bits.
         prior: mean and deviation of y before the codeword.
         dither: kind of the random number that the encoder adds before rounding.
     """
+    # Few codewords: all are summed, from number 0 on. A block has 2^BLOCK (8) of them.
     if grid.bits <= TABLE:
+        first_word = jnp.zeros(())
         blocks = 2 ** max(grid.bits - BLOCK, 0)
-        return find_effect_from_sums(sum_neighbouring_words(pairs, weights, jnp.zeros(()), blocks, grid, prior, dither))
-
+        sums = sum_neighbouring_words(pairs, weights, first_word, blocks, grid, prior, dither)
+        return find_effect_from_sums(sums)
+    # Many: which of two ways depends on the prior, which is known only when the program runs.
     arguments = pairs, weights, received, grid, prior, dither
     sum_wide_words, sum_fine_words = partial(_sum_wide_words, *arguments), partial(_sum_fine_words, *arguments)
     effect: WordEffect = jax.lax.cond(grid.step >= FINE * prior.deviation, sum_wide_words, sum_fine_words)

@@ -17,12 +17,12 @@ class LikelihoodSums(NamedTuple):
     second: jax.Array
 
     def plus(self, other: "LikelihoodSums") -> "LikelihoodSums":
-        """Return the sums over these words and others."""
+        """Return the sums over these words and others: sums over separate parts of y add up."""
         return LikelihoodSums(self.mass + other.mass, self.first + other.first, self.second + other.second)
 
 
 class WordGrid(NamedTuple):
-    """Words of one component: the lowest, the step, and their number."""
+    """The codewords of one component: the values low + i step, i = 0, ..., 2^bits - 1; `bits` 0: without end."""
 
     low: jax.Array
     step: jax.Array
@@ -30,7 +30,7 @@ class WordGrid(NamedTuple):
 
 
 class SignalPrior(NamedTuple):
-    """Mean and deviation of y before the word."""
+    """Mean and standard deviation of the Gaussian law of y before its codeword is received."""
 
     mean: jax.Array
     deviation: jax.Array
