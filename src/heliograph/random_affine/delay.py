@@ -29,7 +29,7 @@ T = TypeVar("T")
 
 
 class AbstractDelayLine(AbstractMapWrapper):
-    """Map of the tapped delay line (y_k, y_{k-1}, ..., y_{k-past}), stacked."""
+    """Link with a delay, as a map of the delay line (y_k, y_{k-1}, ..., y_{k-past}) of the last signals, stacked."""
 
     @property
     def line(self) -> AbstractRandomAffine:
@@ -151,12 +151,12 @@ class DelayedLink(AbstractDelayLine):
 
     @property
     def past(self) -> int:
-        """Longest delay in steps."""
+        """Longest possible delay in steps, which is the number of past signals in the delay line."""
         return max(self.times)
 
     @property
     def constant(self) -> bool:
-        """True if the delay never varies."""
+        """True if the delay is one number of steps, and not drawn from a law or given by a chain."""
         return isinstance(self.delay, GainAndNoise)
 
     def carry_angles(self, sent: Angles) -> Angles:
@@ -224,7 +224,7 @@ def place_on_delay_line(channel: T) -> T:
 
 
 def signal_size(channel: AbstractRandomAffine) -> int:
-    """Return the numbers that are sent to a channel at each step."""
+    """Return how many numbers are sent to a channel at each step: its inputs, without those of past signals."""
     return channel.inputs // (1 + channel.past)
 
 

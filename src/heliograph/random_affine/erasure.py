@@ -28,7 +28,7 @@ class Erasure(AbstractMapWrapper):
 
     @property
     def erases(self) -> bool:
-        """Always True."""
+        """Always True: outputs may be lost, and are NaN then."""
         return True
 
     def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
@@ -59,7 +59,7 @@ class Erasure(AbstractMapWrapper):
         return self.base.carry_angles(sent)
 
     def in_words(self) -> str:
-        """Return the map in words, and how much of it is lost."""
+        """Return a text such as "Rician hop, 5% lost"."""
         return f"{self.base.in_words() or DIRECT}, {write_percentage(1 - self.arrival)} lost"
 
     def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:

@@ -26,8 +26,8 @@ from heliograph.random_affine.moments.monomials import (
 from heliograph.random_affine.moments.signal_path import ChannelPosition, Visit, refuse_gain_on_angles
 from heliograph.random_affine.noises.noise import AbstractNoise, Gaussian, Matrix, Vector, as_noise, noise_moment_vector
 
-NOTHING_SENT = "nothing sent"  # in words
-ROUNDING = 1e-12  # of a gain of 1 that was computed
+NOTHING_SENT = "nothing sent"  # text for a hop whose matrix A is zero
+ROUNDING = 1e-12  # a computed gain this near to 1 is taken as 1
 
 
 class AbstractHop(AbstractRandomAffine):
@@ -38,22 +38,22 @@ class AbstractHop(AbstractRandomAffine):
 
     @property
     def outputs(self) -> int:
-        """Length of z."""
+        """Length of z = g A y + n: the number of rows of A."""
         return int(self.matrix.shape[-2])
 
     @property
     def inputs(self) -> int:
-        """Length of y."""
+        """Length of the signal y that is sent through this hop z = g A y + n: the number of columns of A."""
         return int(self.matrix.shape[-1])
 
     @property
     def transmits(self) -> bool:
-        """True of a radio; False of a wire, which passes its input on without gain and noise."""
+        """True for a radio; False for a wire, z = A y: a gain g that is the constant 1, and no noise."""
         return not (self._gain_is_one and is_zero(self.noise.covariance))
 
     @property
     def _gain_is_one(self) -> bool:
-        """True of a gain that is known to be one; by default none is."""
+        """True if the gain g is known to be the constant 1; by default it is not known."""
         return False
 
     def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
@@ -164,7 +164,8 @@ class GainAndNoise(AbstractHop):
         for b, (low, high) in zip(coefficients, gain_intervals, strict=True):
             lows.append(xp.minimum(b * low, b * high))
             highs.append(xp.maximum(b * low, b * high))
-        return sum(lows), sum(highs)
+        lowest, highest = sum(lows), sum(highs)
+        return lowest, highest
 
     def covers_kind(self, actual: AbstractRandomAffine, same_noise: SameNoise) -> bool:
         """Return whether `actual` is a hop with this matrix and noise, and a law of the gain that is possible here."""
@@ -191,7 +192,7 @@ class GainAndNoise(AbstractHop):
         gain = self.law.constant
         if gain is None or is_traced(gain):
             raise refuse_gain_on_angles(f"a gain that is {type(self.law).__name__}")
-        # Gains of 0 or more that are whole and sum to 1: a single one that is 1.
+        # In each row of g A the gains must be whole, at least 0, and sum to 1: then a single one is 1, the others 0.
         gains = float(gain) * np.asarray(self.matrix)[taking]
         are_whole = np.abs(gains - np.round(gains)) <= ROUNDING
         if not np.all(are_whole & (np.round(gains) >= 0)) or np.any(np.round(gains).sum(axis=1) != 1):
@@ -201,10 +202,14 @@ class GainAndNoise(AbstractHop):
     def list_atoms(self) -> list[AffineComponent]:
         """Return every combination of a value g of the gain with an atom n = c + N(0, R) of the noise.
 
-        A combination has the product of both probabilities, and is the map y -> g A y + c + N(0, R).
+        A combination has the product of both probabilities, P(g) P(atom), and is the map y -> g A y + c + N(0, R).
         """
-        gains, noises = self.law.list_atoms(), self.noise.list_atoms()
-        return [AffineComponent(p * q, g * self.matrix, c, R) for p, g in gains for q, c, R in noises]
+        atoms = []
+        for probability_of_gain, g in self.law.list_atoms():
+            for probability_of_atom, c, R in self.noise.list_atoms():
+                weight = probability_of_gain * probability_of_atom
+                atoms.append(AffineComponent(weight, g * self.matrix, c, R))
+        return atoms
 
     def disturb_gain(self) -> DisturbedGain:
         """Return E[H_ab] and E[H_ab H_ij] of H = [g A, N], where N N' is the covariance of the noise.
@@ -251,7 +256,7 @@ class GainAndNoise(AbstractHop):
 
     @property
     def _gain_is_one(self) -> bool:
-        """True of a gain that is known to be one."""
+        """True if the gain g is the constant 1, and its value is known now (not traced by JAX)."""
         gain = self.law.constant
         return gain is not None and not is_traced(gain) and float(gain) == 1.0
 
@@ -270,8 +275,8 @@ def affine_matrix(matrix: Matrix) -> Matrix:
 
 
 def tabulate_gain_moments(law: AbstractLaw, order: int) -> Vector:
-    """Return E[g^k] for k = 0, ..., order."""
-    moment = law.moment  # of a module, whose methods are slow to look up
+    """Return the moments E[g^k] of a gain, k = 0, ..., order; shape (order + 1,)."""
+    moment = law.moment  # looked up once: attribute access of a module is slow
     return stack_parts([moment(k) for k in range(order + 1)])
 
 

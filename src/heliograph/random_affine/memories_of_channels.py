@@ -16,12 +16,12 @@ T = TypeVar("T")
 
 
 class AbstractWithMemory(Module):
-    """Whatever has a law at each step that depends on the state of a memory."""
+    """A model whose law at each step depends on the state of its `memory`: a Markov chain's mode, a drifting gain."""
 
     memory: eqx.AbstractVar[AbstractMemory]
 
     def given(self, state: int | float | jax.Array | np.ndarray) -> Any:
-        """Return the same without memory, for this state of the memory."""
+        """Return the model that this one is while its memory has this state; it has no memory itself."""
         raise unwritten(self, "given")
 
 
@@ -42,7 +42,11 @@ def select_model_of_equal_structure(models: Sequence[T], state: jax.Array) -> T 
 
 
 class ChannelState(NamedTuple):
-    """State of a channel: of its memories, in order of appearance, and of the map given them."""
+    """State of a channel that remembers.
+
+    memories: state of each of its memories, in the order of `memories(channel)`. rest: state of the map that the
+    channel is given these states; () if that map is independent over time.
+    """
 
     memories: tuple[jax.Array, ...]
     rest: PyTree[jax.Array]

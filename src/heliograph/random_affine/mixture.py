@@ -91,7 +91,7 @@ class Mixture(AbstractOneOfSeveralMaps, AbstractCombination):
         return by_corner
 
     def corner_count(self) -> int:
-        """Return the extreme weights times the product of the maps' counts."""
+        """Return the number of extreme laws of the choice, times that of combinations of extreme laws of the maps."""
         return len(self.choice.corners()) * super().corner_count()
 
     def covers_kind(self, actual: AbstractRandomAffine, same_noise: SameNoise) -> bool:
@@ -143,9 +143,10 @@ class Mixture(AbstractOneOfSeveralMaps, AbstractCombination):
         """Return the map z = E[G] y + n, where n is Gaussian with the mean and covariance of the mixture's noise."""
         moments = self.moments(2)
         mean = moments.mean
+        # Rows of the monomials z_i z_j in E[Sym^2(H)], at [i, j]; the last index, left out, is that of the constant 1.
         noise_products = product_table(self.outputs + 1, first=1, second=1)[:-1, :-1]
         second_moment = moments.matrix[noise_products, -1]  # E[n n'], the coefficients of the monomial 1
-        offset = mean[:-1, -1]
+        offset = mean[:-1, -1]  # E[n], last column of H = [[G, n], [0, 1]]
         square_of_mean = offset[:, None] * offset
         noise = Gaussian(second_moment - square_of_mean, offset)
         return GainAndNoise(Constant(1.0), mean[:-1, :-1], noise)

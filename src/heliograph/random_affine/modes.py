@@ -33,7 +33,7 @@ from heliograph.random_affine.moments.monomials import JointMoments
 from heliograph.random_affine.moments.signal_path import ChannelPosition, Visit
 from heliograph.random_affine.noises.noise import AbstractNoise, Matrix, as_noise
 
-MODES = 1024  # joint modes that are listed: a filter's matrices have as many blocks in a row
+MODES = 1024  # most joint modes of all memories: a filter's matrices have as many blocks in a row
 
 
 class Modes(AbstractOneOfSeveralMaps, AbstractModal):
@@ -61,9 +61,9 @@ class Modes(AbstractOneOfSeveralMaps, AbstractModal):
             check_forgets("map of a mode", m)
 
     def given(self, state: int | float | jax.Array | np.ndarray) -> AbstractRandomAffine:
-        """Return the map of this mode.
+        """Return the map of the mode with the number `state`.
 
-        If JAX traces the mode and the maps differ only in numbers, it is one map with the chosen numbers. If they
+        If JAX traces the number and the maps differ only in numbers, it is one map with the chosen numbers. If they
         differ in structure, it is a map that holds all of them and chooses what they return.
         """
         if isinstance(state, int | np.integer):
@@ -84,22 +84,22 @@ class Modes(AbstractOneOfSeveralMaps, AbstractModal):
         return all(assumed_map.covers(actual_map, same_noise) for assumed_map, actual_map in pairs)
 
     def in_words(self) -> str:
-        """Return the maps in words, and the name of the memory."""
+        """Return a text such as "'state': modes (hop or nothing sent)", with the name of the memory and the maps."""
         return f"{self.memory_in_words}modes ({' or '.join(affine.in_words() or DIRECT for affine in self.maps)})"
 
 
 class _MapOfTracedIndex(AbstractOneOfSeveralMaps):
-    """The map of a traced index among several."""
+    """The map maps[index], for an index that JAX traces and maps that differ in structure."""
 
     maps: tuple[AbstractRandomAffine, ...]
     index: jax.Array
 
     def sample(self, key: jax.Array) -> jax.Array:
-        """Draw from the map of the index."""
+        """Draw H of every map, and return that of maps[index]."""
         return jnp.stack([m.sample(key) for m in self.maps])[self.index]
 
     def moments(self, order: int) -> JointMoments:
-        """Return the moments of the map of the index."""
+        """Return E[Sym^order(H)] of maps[index], by computing it for every map."""
         matrices = [jnp.asarray(m.moments(order).matrix) for m in self.maps]
         return JointMoments(jnp.stack(matrices)[self.index], self.outputs, self.inputs, order)
 
@@ -117,7 +117,7 @@ class ModeOutput(AbstractModal):
 
     @property
     def inputs(self) -> int:
-        """Length of y."""
+        """Length of y, none of which is in z."""
         return self.sent
 
     def carry_angles(self, sent: Angles) -> Angles:
@@ -134,7 +134,10 @@ class ModeOutput(AbstractModal):
 
 
 class OneStepLate(AbstractMapWrapper):
-    """Map of which each step receives what was drawn at the step before; NaN at the first."""
+    """Map z_k = G_(k-1) y_k + n_(k-1), with what `base` drew one step earlier; z_0 is NaN.
+
+    It delivers side information, such as a mode's number, that is known one step late.
+    """
 
     base: AbstractRandomAffine
 
@@ -209,21 +212,22 @@ class Faded(AbstractHop, AbstractModal):
         self.noise = as_noise("channel noise", noise, self.matrix.shape[0])
 
     def in_words(self) -> str:
-        """Return what it is, and the name of the memory."""
+        """Return a text such as "'fading': drifting hop", with the name of the memory if it has one."""
         return f"{self.memory_in_words}drifting hop"
 
     def given(self, state: int | float | jax.Array | np.ndarray) -> GainAndNoise:
-        """Return the map with the gain mean + deviation c."""
+        """Return the hop z = (mean + deviation c) A y + n, where c is the `state` of the memory."""
         drift = self.deviation * state
         gain = self.mean + drift
         return GainAndNoise(Constant(gain), self.matrix, self.noise)
 
 
 class JointModes(Module):
-    """Map as one chain and one map without memory for each of its modes.
+    """A channel with memories as one Markov chain (its joint modes), and one map without memory for each mode.
 
-    Where a fading drifts, its modes are the nodes of `AbstractMemory.nodes`: expectations are right, and `initial` and
-    `transition` need not be probabilities. A map without memory has one mode.
+    A mode is a combination of one state of each memory. For a drifting fading these states are the quadrature nodes of
+    `AbstractMemory.nodes`: expectations are right, but `initial` and `transition` may be negative, and then are no
+    probabilities. A channel without memory has one mode.
 
     Args:
         initial: law of the mode at the first step (modes,).
@@ -240,7 +244,7 @@ class JointModes(Module):
     beside: tuple[PyTree, ...]
 
     def moments(self, order: int) -> Float[jax.Array | np.ndarray, "modes rows columns"]:
-        """Return E[Sym^order(H) | mode] of each mode; times transition[i, j], it is block (j, i) of joint moments."""
+        """Return E[Sym^order(H) | mode j] at [j]; block (j, i) of the joint moments is transition[i, j] times it."""
         return stack_parts([m.moments(order).matrix for m in self.maps])
 
 
@@ -278,7 +282,7 @@ def joint_modes(
     # Independent memories: their laws multiply.
     initial = reduce(xp.kron, [chain.initial for chain in chains], np.ones(1))
     transition = reduce(xp.kron, [chain.transition for chain in chains], np.ones((1, 1)))
-    # The largest that each joint transition may be: the product of the largest ones.
+    # Upper end of each joint transition probability: the product of the upper ends.
     largest = reduce(xp.kron, [chain.transition + chain.radius for chain in chains], np.ones((1, 1)))
     # The state of each memory in each joint mode, and the maps given these.
     states_by_mode = [
@@ -309,7 +313,7 @@ def _represent_memory_by_nodes(memory: AbstractMemory, degree: int, nodes: int |
 
 
 ROUNDING = 1e-12  # relative: of sums over modes that cancel
-DOUBLINGS = 60  # of the steps after which the law of the modes is that of the long run
+DOUBLINGS = 60  # 2^60 steps, after which the law of the modes is that of the long run
 
 
 def redraw_modes_each_step(channel: AbstractRandomAffine) -> AbstractRandomAffine:
@@ -323,9 +327,11 @@ def redraw_modes_each_step(channel: AbstractRandomAffine) -> AbstractRandomAffin
 
 
 def mix_maps_of_modes(modes: JointModes, law: np.ndarray | None = None) -> AbstractRandomAffine:
-    """Return one of the modes' maps, by a law (that of the long run unless given)."""
-    in_the_long_run = long_run_law(np.asarray(modes.initial), np.asarray(modes.transition))
-    return Mixture(modes.maps, in_the_long_run / in_the_long_run.sum() if law is None else law)
+    """Return the mixture that is the map of mode i with probability law[i]; by default the chain's long-run law."""
+    if law is None:
+        in_the_long_run = long_run_law(np.asarray(modes.initial), np.asarray(modes.transition))
+        law = in_the_long_run / in_the_long_run.sum()
+    return Mixture(modes.maps, law)
 
 
 def long_run_law(initial: Float[np.ndarray, " modes"], chain: Float[np.ndarray, "modes modes"]) -> np.ndarray:
@@ -342,7 +348,7 @@ def long_run_law(initial: Float[np.ndarray, " modes"], chain: Float[np.ndarray, 
 
 
 def mode_laws_over_time(steps: Sequence[JointModes]) -> list[np.ndarray]:
-    """Return the probabilities of the modes at each step, from the first law and each step's transitions."""
+    """Return the probabilities (modes,) of the modes at each step: p_(k+1) = p_k Pi_k with the transitions Pi_k."""
     laws = [np.asarray(steps[0].initial)]
     for step in steps[:-1]:
         laws.append(laws[-1] @ np.asarray(step.transition))

@@ -13,7 +13,7 @@ from heliograph.random_affine.hop import known
 from heliograph.random_affine.moments.monomials import JointMoments, list_exponents, symmetric_power
 from heliograph.random_affine.moments.signal_path import ChannelPosition, Visit
 
-# (a, b, 1) to (w, its conjugate, 1) with w = a + i b.
+# Matrix that takes (a, b, 1) to (w, v, 1) with w = a + i b and its conjugate v = a - i b.
 TO_COMPLEX = np.array([[1, 1j, 0], [1, -1j, 0], [0, 0, 1]])
 
 
@@ -68,9 +68,9 @@ class Rotation(AbstractRandomAffine):
         return JointMoments(matrix.real, outputs=2, inputs=2, order=order)
 
     def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
-        """Return the map as it is, and the place as it was: it has no transmitter."""
+        """Return the map and the position unchanged: a rotation has no transmitter."""
         return self, position
 
     def mean_gain(self) -> AbstractRandomAffine:
-        """Return the map exp(-deviation^2 / 2) y."""
+        """Return the map z = exp(-deviation^2 / 2) y of the mean gain E[H]."""
         return known(self.moments(1).mean[:-1, :-1])

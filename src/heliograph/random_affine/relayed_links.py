@@ -73,7 +73,10 @@ class RelayStorage(AbstractMapWrapper):
 
 
 class RelayedLinks(AbstractDelayLine):
-    """Links in series, each but the first with a random delay of what the one before delivered."""
+    """Links in series whose relays store signals: each stage but the first delays, at random, what the one before sent.
+
+    stages: the links, first that of the sensor.
+    """
 
     stages: tuple[AbstractRandomAffine, ...]
 
@@ -99,7 +102,7 @@ class RelayedLinks(AbstractDelayLine):
 
     @property
     def past(self) -> int:
-        """The longest delay of all together."""
+        """Longest possible delay from the first link to the last, in steps: the sum of the stages' longest delays."""
         return sum(stage.past for stage in self.stages)
 
 

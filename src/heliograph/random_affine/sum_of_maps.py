@@ -31,7 +31,7 @@ from heliograph.random_affine.moments.signal_path import ChannelPosition, Visit
 from heliograph.random_affine.noises.noise import AbstractNoise, Gaussian, Matrix, as_noise, noise_moment_vector
 from heliograph.random_affine.series_and_stack import AbstractCombination, Corners, Series, Stack
 
-Places = tuple[int, ...]  # of what a map takes, among the components of y
+Places = tuple[int, ...]  # indices of the components of y that a map takes
 
 
 class Superposed(AbstractCombination):
@@ -79,7 +79,7 @@ class Superposed(AbstractCombination):
 
     @property
     def inputs(self) -> int:
-        """Length of y."""
+        """Length of the whole y, of which each map takes some components."""
         return self.taken
 
     @property
@@ -249,7 +249,7 @@ def move_sensor_into_links(
 
 
 class _MapsWithMemories(NamedTuple):
-    """Some maps of a sum, by their numbers, and the identities of all memories inside them."""
+    """A group of maps of a sum. memories: identities of all memories inside them. maps: the maps' numbers."""
 
     memories: set[str]
     maps: list[int]
@@ -267,10 +267,15 @@ def split_terms_without_common_memory(channel: AbstractRandomAffine) -> list[Abs
     # Map after map: the groups that share a memory with it are joined, and so are groups without any memory.
     groups: list[_MapsWithMemories] = []
     for i, affine in enumerate(channel.maps):
-        identities, numbers = set(memories(affine)), [i]  # names of its memories; numbers of the maps in the group
-        for group in [group for group in groups if group.memories & identities or not (group.memories or identities)]:
-            groups.remove(group)
-            identities, numbers = identities | group.memories, group.maps + numbers
+        identities = set(memories(affine))  # of its memories
+        numbers = [i]  # of the maps in the new group
+        for group in list(groups):
+            share_memory = bool(group.memories & identities)
+            both_without_memory = not (group.memories or identities)
+            if share_memory or both_without_memory:
+                groups.remove(group)
+                identities = identities | group.memories
+                numbers = group.maps + numbers
         groups.append(_MapsWithMemories(identities, numbers))
     no_noise = as_noise("noise of a term", 0.0, channel.outputs)
     return [

@@ -1,7 +1,6 @@
 """Second moments of a channel, bounded under every possible law."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
@@ -10,7 +9,7 @@ import numpy as np
 from heliograph.factors.covariance_factors import WeightedColumns, columns_of
 from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.module import Module
-from heliograph.numerics.numpy_or_jax import block_diagonal, is_traced, is_zero, library, scatter, stack_parts
+from heliograph.numerics.numpy_or_jax import block_diagonal, is_traced, library, scatter, stack_parts
 from heliograph.numerics.types import Float
 from heliograph.random_affine.base import AbstractRandomAffine, check_forgets, check_maps, count_corners
 from heliograph.random_affine.moments.gain_and_noise_covariances import (
@@ -19,6 +18,7 @@ from heliograph.random_affine.moments.gain_and_noise_covariances import (
     split_off_noise,
 )
 from heliograph.random_affine.moments.interval_products import CORNERS
+from heliograph.random_affine.moments.moment_bounds_of_sum import MomentBounds, bound_sum
 from heliograph.random_affine.moments.moment_tensors import (
     Matrix,
     Tensor,
@@ -33,7 +33,6 @@ from heliograph.random_affine.moments.second_moment_map import (
     place_on_diagonal,
     scale_map,
     signal_of_map,
-    size_of_map,
 )
 from heliograph.random_affine.moments.uncertain_law_bounds import (
     PROPORTIONAL_TOLERANCE,
@@ -46,13 +45,19 @@ from heliograph.random_affine.sum_of_maps import Superposed
 
 
 class SecondOrder(Module):
-    """Mean and second moments of z = G y + n, nominal where the law is known, dominating where it is not.
+    """Mean and second moments of z = G y + n; where several laws v are possible, bounds that hold for all of them.
 
-    mean_gain, offset: M = E[G] and b = E[n] under the nominal law; spread: E_v[((G - M) y + n - b)(...)']; shift: ((M_v
-    - M) y + b_v - b)(...)'; power: E_v[G y y' G'] (the last row and column of W are ignored). nominal: the spread under
-    the nominal law itself, which is gain_covariance : W + Cov n with the columns `noise` of the latter: apart from the
-    gain, so that a combination of outputs that is free of noise stays free of it. Where gain and noise are correlated,
-    gain_covariance is all and noise zero.
+    mean_gain, offset: M = E[G] and b = E[n] under the nominal law.
+    spread: bound of E_v[((G - M) y + n - b)(...)'], the second moment about the nominal mean.
+    shift: bound of ((M_v - M) y + b_v - b)(...)', which the mean under law v adds to it.
+    power: bound of E_v[G y y' G'] (the last row and column of W are ignored).
+    nominal: the spread under the nominal law itself, gain_covariance : W + Cov n.
+    gain_covariance, noise: its two parts. Cov n = B diag(w) B' is kept as B and w, apart from the gain, so that a
+        combination of outputs without noise stays without noise. If gain and noise are correlated, gain_covariance
+        is all and noise zero.
+    uncertain: True if several laws are possible.
+
+    The four bounds take W = E[(y, 1) (y, 1)'] to a matrix (m, m): see `QuadraticMap` (center and radius).
 
     Shapes: mean_gain (m, p), offset (m,), gain_covariance (m, m, p + 1, p + 1), noise (m, m).
     """
@@ -96,14 +101,19 @@ def describe_second_moments(
 
 
 def has_random_gain(channel: AbstractRandomAffine, described: SecondOrder) -> bool:
-    """Return whether z depends on y by a random or uncertain gain, and not only by a known one.
+    """Return whether the gain G of z = G y + n is random or uncertain, and not a known matrix.
 
-    A law that JAX traces has no numbers to look at. It counts as random unless the channel says that its gain is known.
+    `described` is `second_order(channel)`. A law that JAX traces has no numbers to look at: it counts as random unless
+    the channel says that its gain is known.
     """
-    if described.uncertain or is_traced(described.spread):
-        return described.uncertain or not channel.has_known_gain
-    block = np.abs(described.spread.center[..., :-1, :]) + np.abs(described.spread.radius[..., :-1, :])
-    return bool(np.any(block > 0)) and not channel.has_known_gain
+    if described.uncertain:
+        return True
+    if is_traced(described.spread):
+        return not channel.has_known_gain
+    # Covariances of the entries of G with those of (G, n): the last index on this axis, left out, is that of n.
+    center, radius = described.spread.center[..., :-1, :], described.spread.radius[..., :-1, :]
+    size_of_covariances = np.abs(center) + np.abs(radius)
+    return bool(np.any(size_of_covariances > 0)) and not channel.has_known_gain
 
 
 def has_known_mean(described: SecondOrder) -> bool:
@@ -150,16 +160,6 @@ def second_order(channel: AbstractRandomAffine) -> SecondOrder:
     )
 
 
-class MomentBounds(NamedTuple):
-    """Nominal mean of (G, n), bounds of spread, shift and power, and the nominal spread."""
-
-    mean: Matrix
-    spread: QuadraticMap
-    shift: QuadraticMap
-    power: QuadraticMap
-    nominal: QuadraticMap
-
-
 def _bound_moments(channel: AbstractRandomAffine) -> MomentBounds:
     """Return M = E[(G, n)] under the nominal law, and bounds of second moments of z = G y + n under all laws v.
 
@@ -197,7 +197,7 @@ def _take_known_moments(channel: AbstractRandomAffine) -> MomentBounds:
             nominal=spread,
         )
     moments = channel.moments(2)
-    mean = moments.mean[:-1]
+    mean = moments.mean[:-1]  # E[(G, n)]: H without its last row (0, 1)
     covariance, shift, power = tensors_of_law(moments, mean)
     spread = map_of_known_law(_drop_known_gain(channel, covariance))
     return MomentBounds(
@@ -216,9 +216,9 @@ def _bound_uncertain_moments(channel: AbstractRandomAffine, can_list_corners: bo
     `can_list_corners` says whether the extreme laws ("corners") are few enough to be computed one by one.
     """
     if isinstance(channel, Superposed) and not can_list_corners:
-        return _bound_sum(channel, [_bound_moments(affine) for affine in channel.maps])
+        return bound_sum(channel, [_bound_moments(affine) for affine in channel.maps])
     nominal = channel.moments(2)
-    mean = nominal.mean[:-1]
+    mean = nominal.mean[:-1]  # E[(G, n)]: H without its last row (0, 1)
     # Bounds from the blocks of a stack, as maxima over the extreme laws, or from intervals of moments.
     if isinstance(channel, Stack):
         bounds = _bound_stacked_maps(channel)
@@ -251,8 +251,8 @@ def _drop_known_gain(channel: AbstractRandomAffine, spread: Tensor) -> Tensor:
     As differences of moments they have rounding there. `spread` has at [i, j, a, b] that of entries (i, a) and (j, b).
     """
     is_random = ~channel.known_gains
-    gain_varies = np.outer(is_random, np.ones(channel.inputs))
-    varies = np.pad(gain_varies, ((0, 0), (0, 1)), constant_values=1.0)  # noise always varies
+    gain_varies = np.outer(is_random, np.ones(channel.inputs))  # (m, p): 1 for a random entry of G
+    varies = np.pad(gain_varies, ((0, 0), (0, 1)), constant_values=1.0)  # and for the noise, which always varies
     without_rounding: Tensor = library(spread).where(symmetric_product(varies, varies) > 0, spread, 0.0)
     return without_rounding
 
@@ -340,60 +340,3 @@ def _stack_covariances(spreads: Sequence[Tensor]) -> Tensor:
     entries = library(spreads).concatenate([spread.reshape(-1, size**2) for spread in spreads])
     stacked: Tensor = scatter((outputs**2, size**2), places, entries).reshape(outputs, outputs, size, size)
     return stacked
-
-
-def _bound_sum(channel: Superposed, parts: Sequence[MomentBounds]) -> MomentBounds:
-    """Return the bounds of a sum of independent maps and a noise, from those of each map.
-
-    Spreads (second moments about nominal means) add up; shifts of means, D_i, between laws meet in every pair of maps.
-    With Y = E[(y, 1) (y, 1)'] and weights w of sum 1, in proportion to the shifts' sizes, (sum D_i) Y (sum D_i)' <=
-    sum_i D_i Y D_i' / w_i, and the spread of the sum is within sum_i Spread_i + (1 / w_i - 1) D_i Y D_i'.
-
-    Args:
-        channel: the sum.
-        parts: bounds of each of its maps.
-    """
-    # Nominal mean, map of the noise, of the mean's power, and sum of the spreads.
-    every = range(len(parts))  # numbers of the parts
-    mean = channel.sum_in_places({i: parts[i].mean for i in every}, axes=1)
-    mean = mean + channel.noise.mean[:, None] * np.eye(channel.inputs + 1)[-1]
-    noise = map_of_known_law(channel.noise.covariance[..., None, None] * make_power_of_constant(channel.inputs + 1))
-    power_of_mean = map_of_known_law(drop_constant(symmetric_product(mean, mean)))
-    spread = add_maps(_sum_maps(channel, {i: (parts[i].spread, 1.0) for i in every}), noise)
-    # All means are known: no shifts.
-    sizes = [size_of_map(bounds.shift) for bounds in parts]
-    total = sum(sizes)
-    if is_zero(total):
-        return MomentBounds(
-            mean=mean,
-            spread=spread,
-            shift=scale_map(noise, 0.0),
-            power=add_maps(signal_of_map(spread), power_of_mean),
-            nominal=spread,
-        )
-    inverse_weights = {i: total / sizes[i] for i in every if not is_zero(sizes[i])}  # 1 / w_i
-    shift = _sum_maps(channel, {i: (parts[i].shift, inverse) for i, inverse in inverse_weights.items()})
-    cross = _sum_maps(channel, {i: (parts[i].shift, inverse - 1) for i, inverse in inverse_weights.items()})
-    # Power: of the mean m shifted by d, (m + d)^2 <= (1 + d / m) m^2 + (1 + m / d) d^2, and the variances.
-    mean_size = size_of_map(power_of_mean)
-    ratio = total / library(mean_size).where(mean_size > 0, mean_size, 1.0)  # d / m
-    widened_mean, widened_shift = scale_map(power_of_mean, 1 + ratio), scale_map(signal_of_map(shift), 1 + 1 / ratio)
-    return MomentBounds(
-        mean=mean,
-        spread=add_maps(spread, cross),
-        shift=shift,
-        power=add_maps(signal_of_map(spread), widened_mean, widened_shift),
-        nominal=add_maps(_sum_maps(channel, {i: (parts[i].nominal, 1.0) for i in every}), noise),
-    )
-
-
-def _sum_maps(channel: Superposed, weighted: Mapping[int, tuple[QuadraticMap, Any]]) -> QuadraticMap:
-    """Return sum_i w_i Q_i, the second-moment maps Q_i of some of the summands z_i = H_i (y_i, 1) of a channel.
-
-    `weighted` holds (Q_i, w_i) by the summand's number i. Q_i acts on E[(y_i, 1) (y_i, 1)'] of the components y_i of y
-    that summand i takes. The sum acts on E[(y, 1) (y, 1)'], with the entries of each Q_i at these components.
-    """
-    scaled = {i: scale_map(moment_map, weight) for i, (moment_map, weight) in weighted.items()}
-    centers = {i: moment_map.center for i, moment_map in scaled.items()}
-    radii = {i: moment_map.radius for i, moment_map in scaled.items()}
-    return QuadraticMap(channel.sum_in_places(centers, axes=2), channel.sum_in_places(radii, axes=2))

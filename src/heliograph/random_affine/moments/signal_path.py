@@ -12,7 +12,7 @@ from heliograph.numerics.types import Array, Float, Scalar
 from heliograph.random_affine.moments.monomials import JointMoments
 
 T = TypeVar("T")
-Second = Float[Array, "p p"]  # E (y, 1)(y, 1)'
+Second = Float[Array, "p p"]  # second moment E (y, 1)(y, 1)' of a signal y and the constant 1
 
 
 class SignalMoment(NamedTuple):
@@ -22,9 +22,8 @@ class SignalMoment(NamedTuple):
     arrives: Scalar
 
 
-Visit = Callable[
-    [str, Any, SignalMoment | None], Any
-]  # of the name of a hop, the hop, and what it receives: another hop
+# Function of a hop's name, the hop, and the second moment of what it receives; it returns a hop to put in its place.
+Visit = Callable[[str, Any, SignalMoment | None], Any]
 
 
 class ChannelPosition(NamedTuple):
@@ -88,5 +87,6 @@ def refuse_gain_on_angles(got: str) -> ValueError:
 
 
 def apply(h: jax.Array, y: jax.Array) -> jax.Array:
-    """Return z = G y + n for a drawn H."""
-    return h[:-1, :-1] @ y + h[:-1, -1]
+    """Return z = G y + n for a drawn H = [[G, n], [0, 1]] of shape (outputs + 1, inputs + 1)."""
+    gain, noise = h[:-1, :-1], h[:-1, -1]
+    return gain @ y + noise

@@ -76,7 +76,10 @@ class AbstractNoise(Module):
         return False
 
     def branches(self) -> GaussianBranches:
-        """Return each component as a mixture of Gaussian branches about the mean; one unless the law says more."""
+        """Return each component's law as a mixture of Gaussians ("branches"), whose means are relative to E[n].
+
+        By default it is one branch: N(0, variance), exact for Gaussian noise.
+        """
         variances = library(self.covariance).diagonal(self.covariance)[:, None]
         return GaussianBranches(np.zeros((self.dimension, 1)), np.zeros((self.dimension, 1)), variances)
 
@@ -104,7 +107,7 @@ class AbstractNoise(Module):
         return SignalNoise(self.columns, self.covariance)
 
     def list_atoms(self) -> list[NoiseAtom]:
-        """Return all combinations of the atoms of the noise, where these are finitely many; by default a refusal."""
+        """Return the noise as a mixture of atoms c + N(0, R) with probabilities; by default raise ValueError."""
         raise fail("mixture filter", "noises of finite support or Gaussian", type(self).__name__)
 
     def split(self, groups: Sequence[Sequence[int]]) -> "list[AbstractNoise] | None":
@@ -113,11 +116,11 @@ class AbstractNoise(Module):
         return self._split(groups) if complete and not is_traced(self) else None
 
     def _split(self, groups: Sequence[Sequence[int]]) -> "list[AbstractNoise] | None":
-        """Split at complete groups; by default, None."""
+        """Return the noise of each group, where groups have all components; None (the default) if not independent."""
         return None
 
     def sample(self, key: jax.Array) -> jax.Array:
-        """Draw one vector; shape (dimension,)."""
+        """Draw one noise vector n of shape (dimension,)."""
         raise unwritten(self, "sample")
 
     def moment(self, powers: Exponents) -> Number:
@@ -160,7 +163,7 @@ class Gaussian(AbstractNoise):
 
     @property
     def is_symmetric(self) -> bool:
-        """Always True."""
+        """Always True: a Gaussian law is symmetric about its mean."""
         return True
 
     def list_atoms(self) -> list[NoiseAtom]:
@@ -377,6 +380,9 @@ def count_components(value: NoiseLike) -> int | None:
 
 @singledispatch
 def noise_moment_vector(noise: AbstractNoise, order: int) -> Vector:
-    """Return E[mono_order(n)] of a noise law: all moments up to `order`, (C(dimension + order, order),)."""
-    moment = noise.moment  # of a module, whose methods are slow to look up
+    """Return all moments E[n^a] with |a| <= `order` of a noise law, (C(dimension + order, order),).
+
+    They are in the order of the monomials n^a 1^(order - |a|) in `list_exponents`.
+    """
+    moment = noise.moment  # looked up once: attribute access of a module is slow
     return stack_parts([moment(powers[:-1]) for powers in list_exponents(noise.dimension + 1, order)])
