@@ -35,7 +35,10 @@ from heliograph.numerics.types import Array, Bool, Float
 
 
 class PastReports(NamedTuple):
-    """Reports sent 0, 1, ... steps ago: mean gain, offset, mean noise Cov(z | sent), and the quantizers' error.
+    """Model of the reports that each node sent 0, 1, ... steps ago (the age), z = G (m + mu) + n.
+
+    m is the node's estimate and mu the error of its quantizer. gain: E[G]. offset: E[n]. noise: the mean of Cov(z | m).
+    error: bound of |mu|, zero without a quantizer.
 
     Shapes: gain (age, node, m, n), offset (age, node, m), noise (age, node, m, m), error (age, node, n).
     """
@@ -109,11 +112,12 @@ def make_lossless_links(nodes: int, n: int) -> ReportModel:
 
 
 def make_initial_belief(errors: ErrorMoments, delays: int, received: int, quantized: bool) -> ReportsBelief:
-    """Return the centre's state (x, e_1, ..., e_nodes, past reports) before the first report.
+    """Return the centre's belief of s = (x, e_1, ..., e_nodes, past reports) before the first report.
 
     A report is the estimate that a node sends to the centre, and may arrive some steps late. Filters start at known
-    means m_i, so that each error e_i = x_0 - m_i deviates from its mean as x_0 does: x and all e_i share one root of
-    Cov x_0. Nothing has been sent: past reports are zeros.
+    means m_i, so that each error e_i = x_0 - m_i deviates from its mean as x_0 does. With Cov x_0 = R diag(w) R' the
+    covariance of s is [R; R; ...; R; 0] diag(w) [...]': kept as this root and w. Nothing has been sent: past reports,
+    and the gains, offsets and noises of their model (`PastReports`), are zeros.
 
     Args:
         errors: mean and covariance of (x, e_1, ..., e_nodes) at the start.
@@ -123,7 +127,7 @@ def make_initial_belief(errors: ErrorMoments, delays: int, received: int, quanti
     """
     nodes, n = errors.bias.shape
     padding = (0, nodes * n * delays)  # zeros for past reports
-    # Cov x_0 = R diag(weights) R'. The rows of R serve x and every e_i alike; those of past reports are zeros.
+    # The root of Cov s: R once for x and once for every e_i, then rows of zeros for the past reports.
     start = columns_of(errors.state_covariance)
     root_of_x_and_errors = jnp.tile(jnp.asarray(start.matrix), (1 + nodes, 1))
     root = jnp.pad(root_of_x_and_errors, (padding, (0, 0)))
@@ -303,16 +307,18 @@ def _prepend_present_reports(past: PastReports, errors: ErrorMoments, links: Rep
 
 
 def _make_output_matrix(past: PastReports, length: int) -> Float[jax.Array, "M N"]:
-    """Return C of E[reports] = C s for the state s = (x, e_1, ..., e_nodes, what was sent 1, 2, ... steps before).
+    """Return C of E[reports | s] = C s + offset, the matrix of the centre's measurements (ages nodes m, length).
 
-    e_i is the error of node i's estimate x - e_i, which the node sends. A report of age a is its mean gain times what
-    was sent: x - e_i for a = 0, the entry of s for a > 0. Reports (ages, nodes, m) stand one below the other.
+    s has `length` numbers: x (n), the errors e_1, ..., e_nodes (nodes n), then what all nodes sent 1, 2, ... steps
+    before (nodes n for each age). Node i sends its estimate x - e_i. Its report of age a is G_ai times what it sent a
+    steps ago: x - e_i for a = 0, an entry of s for a > 0. Rows of C: age after age, node after node.
     """
     ages, nodes, m, n = past.gain.shape
-    size = nodes * n
-    # What was sent, as linear functions of s: x - e_i at this step, and entries of s at earlier steps.
+    size = nodes * n  # of all errors together, and of what is sent at one step
+    # What was sent, as linear functions of s. At this step [I; ...; I] x - (e_1, ..., e_nodes):
     sent_now = np.concatenate([np.tile(np.eye(n), (nodes, 1)), -np.eye(size)], axis=1)
     sent_now = np.pad(sent_now, ((0, 0), (0, length - n - size)))
+    # At earlier steps: the entries of s behind x and the errors.
     sent_before = np.eye(length - n - size, length, n + size)
     sent = np.concatenate([sent_now, sent_before]).reshape(ages, nodes, n, length)
     return jnp.einsum("aimn,ainN->aimN", past.gain, sent).reshape(ages * nodes * m, length)

@@ -209,7 +209,7 @@ class ErrorSources(NamedTuple):
     independent: Float[Array, "node n n"]
 
     def covariances(self) -> Float[Array, "node n n"]:
-        """Return Cov e_i of each node, by its sources and its own part."""
+        """Return Cov e_i = R_i R_i' + Cov a_i of each node (node, n, n), with R_i = `shared`_i."""
         return self.shared @ self.shared.swapaxes(-1, -2) + self.independent
 
     def joint(self) -> Float[Array, "node n node n"]:
@@ -309,5 +309,5 @@ def _subtract_without_rounding(a: Array, b: Array) -> jax.Array:
 
 
 def _multiply_by_node(matrix: Array, vector: Array) -> jax.Array:
-    """Return the product of matrix and vector for each node."""
+    """Return matrix_i vector_i for each node i: (node, n, m) and (node, m) -> (node, n)."""
     return jnp.einsum("iab,ib->ia", matrix, vector)

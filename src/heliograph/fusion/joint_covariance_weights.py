@@ -23,9 +23,9 @@ Weights = Callable[..., Float[jax.Array, "n node n"]]
 
 
 def _with_joint_check(weights: Weights) -> Weights:
-    """Decorate weights so that they refuse an array that is no joint covariance.
+    """Decorate a function of a joint covariance Cov(e_i, e_j), so that it refuses another shape of its argument.
 
-    It is Cov(e_i, e_j) of all nodes, of shape (nodes, n, nodes, n).
+    The shape is (nodes, n, nodes, n).
     """
 
     @wraps(weights)

@@ -144,5 +144,5 @@ class Fusion(Module):
         return self.rule.claim(quantized_claims)
 
     def _quantizers(self, nodes: Sequence[str]) -> list[Quantizer]:
-        """List the quantizers of all nodes, one for each."""
+        """Return the quantizer of each node, in their order; an empty list if nothing is quantized."""
         return [] if self.quantizer is None else spread_over_names("quantizers", self.quantizer, nodes)

@@ -103,7 +103,7 @@ def widen_by_quantization(covariance: Float[Array, "n n"], error: Float[Array, "
     return (1 + t) * covariance + (r + s) * jnp.diag(error)
 
 
-Parameter = Float[Array, "..."]  # of all components, or of each
+Parameter = Float[Array, "..."]  # one number for all components, or one for each (n,)
 
 
 def find_segment(x: Float[jax.Array, "*n"], amplitude: Parameter, levels: Float[Array, ""]) -> Float[jax.Array, "*n"]:
@@ -133,7 +133,10 @@ def check_parameter(name: str, value: ArrayLike) -> Parameter:
 
 
 def check_positive(name: str, value: ArrayLike) -> Parameter:
-    """Return a parameter that must be positive."""
+    """Return a parameter as an array; raise ValueError unless it is positive.
+
+    A JAX array may be traced, as in learning, and then has no value to compare: it is taken unchecked.
+    """
     numbers = check_parameter(name, value)
     if not isinstance(numbers, jax.Array) and np.any(numbers <= 0):
         raise fail(name, "positive numbers", value)
@@ -175,7 +178,7 @@ class UniformQuantizer(AbstractQuantizer):
     scale: Parameter
 
     def __init__(self, levels: int, amplitude: Float[ArrayLike, "*n"], scale: Float[ArrayLike, "*n"] = 1.0):
-        """Keep the number of segments, the amplitude of what is quantized, and the scale that divides it."""
+        """Check and hold the number of segments of [-amplitude, amplitude], and the unit (`scale`) of x."""
         self.levels = check_levels(levels)
         self.amplitude, self.scale = check_positive("amplitude", amplitude), check_positive("scale", scale)
         check_amplitude("amplitude times scale", self.amplitude, self.scale, self.levels)
@@ -186,7 +189,7 @@ class UniformQuantizer(AbstractQuantizer):
 
     @in_float64
     def step(self, state: PyTree, value: ArrayLike) -> tuple[PyTree, Quantized]:
-        """Quantize with the fixed amplitude."""
+        """Return the unchanged state, and the value (n,) rounded to the midpoint of its segment."""
         x = jnp.asarray(fill_masked(value), dtype=float)
         return state, _quantize_uniformly(x, self.amplitude, self.levels, self.scale)
 

@@ -14,13 +14,13 @@ class GraphLike(Protocol):
     """A graph as networkx has it: `edges()` yields pairs of names, sender first where it `is_directed()`."""
 
     def edges(self) -> Iterable[Any]:
-        """Return the pairs of names."""
+        """Return the edges as pairs of node names, sender first if the graph is directed."""
 
     def nodes(self) -> Iterable[Any]:
         """Return the names of the nodes."""
 
     def is_directed(self) -> bool:
-        """Test whether a pair is one way."""
+        """Return whether an edge leads one way only, from its first node to its second."""
 
 
 FEW = 64  # nodes whose rows stay together
@@ -42,9 +42,10 @@ class Graph(NamedTuple):
 
     @property
     def edges(self) -> Int[np.ndarray, "edge 2"]:
-        """Places of sender and receiver of every edge, receiver after receiver; a node itself is none."""
-        receiver, column = np.nonzero(self.present[:, 1:])
-        return np.stack([self.senders[receiver, column + 1], receiver], axis=1)
+        """Indices (sender, receiver) of every edge, sorted by receiver; a node's own entry is no edge."""
+        receiver, column = np.nonzero(self.present[:, 1:])  # column 0 is the node itself
+        sender = self.senders[receiver, column + 1]
+        return np.stack([sender, receiver], axis=1)
 
     def buckets(self) -> "list[Graph]":
         """Return parts of the rows, those with few neighbours first, without padding that they do not need.

@@ -94,7 +94,8 @@ def propagate_joint_covariance(
     measured = weighted_information @ weights.T
     # Sparse matrices, outside of a program, are made dense before they are added.
     measured = measured if is_traced(measured) else measured.toarray()
-    # F Q F' + W S W', then M J M' plus that; symmetric, as rounding leaves it only nearly.
+    # F Q F' + W S W', with the F_i one below the other, (N, n); then M J M' plus that. (`propagate_by_mode(A, P, Q)` is
+    # A P A' + Q.) The result is made symmetric, as rounding leaves it only nearly.
     added = propagate_by_mode(correction_map.reshape(len(joint), -1), process_noise, measured)
     after = propagate_by_mode(transition, joint, added)
     symmetric: Float[Array, "N N"] = (after + after.T) / 2

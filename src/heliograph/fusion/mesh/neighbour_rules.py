@@ -69,7 +69,7 @@ class TraceIntersection(AbstractIntersection):
         return shares
 
     def neighbour_weights(self, believed: NeighbourEstimates) -> NeighbourWeights:
-        """Find the weights by which a node intersects what arrived from its neighbours."""
+        """Return the weights of covariance intersection, with shares by the traces, of the estimates that arrived."""
         return intersection_weights(believed, choose_shares_by_trace(believed, self.power, self.improvements))
 
 
@@ -77,15 +77,15 @@ class _NeighbourRule(AbstractFusion):
     """Rule that fuses estimates of neighbours only, not at a fusion centre."""
 
     def claim(self, claims: list[Claim]) -> Claim:
-        """Refuse: a fusion centre has no neighbours."""
+        """Raise ValueError: the rule is for neighbours, and a fusion centre has none."""
         raise self._refuse_without_neighbours()
 
     def combine(self, means: Means, covariances: Covariances) -> Fused:
-        """Refuse: a fusion centre has no neighbours."""
+        """Raise ValueError: the rule is for neighbours, and a fusion centre has none."""
         raise self._refuse_without_neighbours()
 
     def _refuse_without_neighbours(self) -> InputError:
-        """Make the ValueError of such a rule at a fusion centre."""
+        """Return the error that the rule is used at a fusion centre, where it needs neighbours."""
         return fail(f"fusion by {type(self).__name__}", "neighbours (Fusion(..., neighbours=...))", "a fusion centre")
 
 
@@ -122,7 +122,7 @@ class DiffusionWeights(_NeighbourRule):
 
     @property
     def needs_joint(self) -> bool:
-        """Always True: the claim is the joint covariance's."""
+        """Always True: the fixed shares do not need it, but the errors' covariance comes from it."""
         return True
 
     def placed(self, graph: Graph) -> "DiffusionWeights":
