@@ -79,7 +79,7 @@ class AbstractFilter(Module):
             refuse_attribute(self, name, INSTEAD)
 
     def init(self) -> PyTree:
-        """Return the state of the filter before the first step."""
+        """Return the filter's state before the first step: what it knows of x_0 before any data, as a pytree."""
         raise unwritten(self, "init")
 
     def predict(self, state: PyTree, u: ArrayLike = (), k: Step = 0) -> PyTree:
@@ -239,7 +239,10 @@ class AbstractFilter(Module):
 
     @property
     def has_score_recursion(self) -> bool:
-        """True if the derivatives of the log-likelihood have a recursion: of a `LinearFilter`, for `score_rows`."""
+        """True if `score_rows` can compute the score, the log-likelihood's derivatives in the model's parameters.
+
+        Only a `LinearFilter` can: a recursion over the rows carries the derivatives of its mean and covariance along.
+        """
         return False
 
     def trace_log_likelihood(self, plain: Callable[..., jax.Array], z: Array, u: Array) -> jax.Array:
@@ -259,7 +262,7 @@ class AbstractFilter(Module):
         return self
 
     def for_single_precision(self) -> "AbstractFilter":
-        """Return the same filter with a mean that keeps its digits in single precision; by default itself."""
+        """Return a filter of the same estimates whose mean keeps its digits in single precision; by default itself."""
         return self
 
     def with_room_for_heartbeats_of(self, others: Sequence["AbstractFilter"]) -> "AbstractFilter":
@@ -272,7 +275,7 @@ class AbstractFilter(Module):
 
     @property
     def attitude(self) -> Angles:
-        """Indices of attitudes among its states: a correction rotates them instead of adding. Most have none."""
+        """Indices of states that are attitudes (rotation vectors): a correction rotates instead of adding."""
         return ()
 
     @property
@@ -361,6 +364,7 @@ def estimates(estimate: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(estimate)
     def call(filter: AbstractFilter, state: PyTree) -> R:
+        """Check the form of the state, and call the method."""
         return call_with_state(filter, state, run)
 
     return cast(Callable[P, R], call)
@@ -376,6 +380,7 @@ def _compile_with_checks(
 
     @wraps(function)
     def call(filter: AbstractFilter, state: PyTree, data: ArrayLike = (), k: Step = 0) -> R:
+        """Check the data (z or u), the step number and the form of the state, and call the compiled method."""
         return call_checked(filter, state, run, check(filter, data), check_step_number(filter, k))
 
     return cast(Callable[P, R], call)

@@ -140,7 +140,7 @@ class Weighed(NamedTuple):
 
 HALF = 0.5  # weight below which a component counts as down-weighted
 NORMAL = 1.96  # quantile of a 95 % interval
-MOST = 0.5  # share of values left out that outliers do not have
+MOST = 0.5  # a share of values left out above this is no matter of outliers
 
 
 @readable

@@ -27,9 +27,10 @@ TOLERANCE = 1e-12  # of correlations and of gains, that are zero but for roundin
 
 
 class NoiseBranches(NamedTuple):
-    """Gaussian branches of each received component's noise: log probability, mean and variance, (m, branches) each.
+    """Noise of each received component as a mixture of Gaussians ("branches"), (m, branches) each.
 
-    `least`: variance of the branch's noise without the spread of the gain, a lower bound of the innovation's variance.
+    log_share: log probability of a branch. mean, variance: its moments. least: its variance without the spread of the
+    gain, a lower bound of the innovation's variance.
     """
 
     log_share: jax.Array
@@ -38,8 +39,11 @@ class NoiseBranches(NamedTuple):
     least: jax.Array
 
     def mean_and_variance(self) -> tuple[jax.Array, jax.Array]:
-        """Return the mean and variance of the mixture of each component's branches, (m,) each."""
-        share = jnp.exp(self.log_share)
+        """Return mean and variance (m,) of each component's noise, a mixture of Gaussians with shares p_j.
+
+        The mean is sum_j p_j m_j, and the variance sum_j p_j (r_j + (m_j - mean)^2) for branches N(m_j, r_j).
+        """
+        share = jnp.exp(self.log_share)  # p_j
         mean = jnp.sum(share * self.mean, axis=1)
         second_about_mean = self.variance + (self.mean - mean[:, None]) ** 2
         return mean, jnp.sum(share * second_about_mean, axis=1)

@@ -101,7 +101,7 @@ class SmootherStep(Module):
 
     @property
     def angles(self) -> Angles:
-        """Indices of angles among the plant's states."""
+        """Indices of the plant's states that are angles."""
         return self.manifold.angles
 
     @property
@@ -218,7 +218,7 @@ def gaussian_of(state: PyTree) -> Any:
 
 
 def with_gaussian(state: PyTree, x: Gaussian) -> PyTree:
-    """Return a filter's state that holds another Gaussian."""
+    """Return a filter's state with `x` as its Gaussian: in its field `gaussian`, or as the state itself."""
     return state._replace(gaussian=x) if hasattr(state, "gaussian") else x
 
 

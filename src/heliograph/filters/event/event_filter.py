@@ -53,7 +53,7 @@ from heliograph.model.trigger import AbstractThreshold
 from heliograph.numerics.types import Array, ArrayLike, Float
 
 RIM = 1e-9  # share of delta by which a value may lie inside for rounding
-COUNTED = 16  # lost transmissions that are counted; more are as many
+COUNTED = 16  # counts 0 to 15 of lost transmissions; the last one stands for all larger ones
 
 
 class Message(NamedTuple):
@@ -108,13 +108,13 @@ class EventFilter(AbstractSizedFilter):
 
     @property
     def senders(self) -> list[slice]:
-        """Components of y that are sent together."""
+        """For each sender the slice of y that it sends: a component each if the rule is for each, else all of y."""
         m = self.outputs
         return [slice(i, i + 1) for i in range(m)] if self.trigger.region == "each" else [slice(0, m)]
 
     @property
     def silence_tells(self) -> bool:
-        """Always true: silence is a measurement."""
+        """Always True: a sender is silent only if |y - r| <= delta, so that silence is a measurement."""
         return True
 
     @compile_on_call
@@ -374,7 +374,7 @@ class EventFilter(AbstractSizedFilter):
 
     @estimates
     def estimate(self, state: EventBelief) -> Estimate:
-        """Return the mean and covariance of the whole sum."""
+        """Return mean and covariance of the plant's state under the whole sum of Gaussians."""
         merged = self._merge_state(state)
         return Estimate(merged.mean, merged.covariance, self.claim)
 

@@ -20,7 +20,7 @@ NODES = NODES + 0.5  # on (0, 1)
 
 
 class BallMoments(NamedTuple):
-    """log P(e in the region), and mean (m,) and covariance (m, m) of e there."""
+    """Moments of a Gaussian vector e in a region: log_mass is log P(e in it); mean (m,) and covariance (m, m) there."""
 
     log_mass: jax.Array
     mean: jax.Array

@@ -27,7 +27,11 @@ from heliograph.numerics.linalg import outer
 
 
 class LinkMoments(NamedTuple):
-    """Moments of z = G y + n: E[(G, n)] (m, p + 1), covariance of the gain and of the noise as in `SecondOrder`."""
+    """Moments of a link z = G y + n.
+
+    mean: E[(G, n)] (m, p + 1). gain_covariance: at [i, j, a, b] the covariance of G_ia and G_jb, with a last row and
+    column for n where gain and noise are correlated (m, m, p + 1, p + 1). noise: columns of Cov n else.
+    """
 
     mean: jax.Array
     gain_covariance: jax.Array

@@ -34,7 +34,7 @@ from heliograph.numerics.trace_settings import KEPT
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 
 Rows = np.ndarray  # an entry for each step along the first axis
-FEW = 10  # effective number of particles below which their moments say nothing
+FEW = 10  # with a lower effective number of particles their mean and covariance say nothing
 
 
 class SteppedFilter(Protocol):
@@ -57,19 +57,19 @@ class SteppedFilter(Protocol):
         """Number of steps that it covers."""
 
     def init(self) -> PyTree:
-        """Return the state before the first row."""
+        """Return the filter's state before the first row."""
 
     def predict(self, state: PyTree, u: ArrayLike, k: Array) -> PyTree:
-        """Return the prior of a row."""
+        """Return the state predicted over step k with the input u."""
 
     def correct(self, state: PyTree, z: ArrayLike, k: Array) -> tuple[PyTree, Innovation]:
-        """Return the posterior of a row, and its innovation."""
+        """Return the state corrected with the measurement z of step k, and the innovation."""
 
     def after_step(self, state: PyTree, k: Array) -> Estimate:
-        """Return the estimate of a row."""
+        """Return mean and covariance of the plant's state after step k."""
 
     def filter_rows(self, z: Array, u: Array, state: PyTree | None = None, begin: Array | int = 0) -> ScanResult | None:
-        """Filter rows by native code of its own, None where it has none."""
+        """Return last state and outputs of rows by native code of the filter's own; None where it has none."""
 
 
 @readable
@@ -306,7 +306,11 @@ def _warn_of_lost_estimate(filter: SteppedFilter, mean: np.ndarray, begin: int) 
 
 
 def _find_origin_of_earlier_result(filter: SteppedFilter, after: Filtered) -> Origin:
-    """Return where an earlier result of this filter ended; raise ValueError if it is another filter's."""
+    """Return the state and step number at which an earlier result of this filter ended, from which `run` goes on.
+
+    Raises:
+        ValueError: a result without them, or one of another kind of filter (another form of its state).
+    """
     expected = "what `run` of this filter returned for the rows before"
     origin = instance("after", after, Filtered, expected).origin
     if origin is None:

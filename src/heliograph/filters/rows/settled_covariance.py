@@ -40,7 +40,7 @@ class SettledState(NamedTuple):
     varies: tuple[bool, ...]
 
     def repeat_with_means(self, means: Sequence[np.ndarray]) -> PyTree:
-        """Return states (n, ...) with these means (n, ...)."""
+        """Return n copies of the settled state, along a leading axis, with these means (n, ...) in place of its own."""
         return with_means(repeat_state(self.state, len(means[0])), means)
 
     def fill_rows(self, varying: list[np.ndarray]) -> PyTree:
@@ -70,7 +70,7 @@ class SettledState(NamedTuple):
         return jax.tree.unflatten(jax.tree.structure(self.outputs), joined)
 
     def select_varying(self, output: PyTree) -> list[Any]:
-        """Return the leaves of a row's output that depend on data."""
+        """Return the leaves of a row's output that depend on data, those for which `self.varies` is True."""
         return [leaf for leaf, varies in zip(jax.tree.leaves(output), self.varies, strict=True) if varies]
 
     def matches(self, states: PyTree) -> Bool[np.ndarray, " n"]:

@@ -90,14 +90,18 @@ class ClockFilter(AbstractWrapper):
     def init(self) -> ClockBelief:
         """Return the law of plant and clocks before any data, in which no clock is observable yet."""
         start = self.base.init()
-        # After n steps of silence a component does not count: so it is for all components before they arrive.
+        # A component that has not arrived for n steps, the number of states, does not count; none has arrived yet.
         silence = jnp.full(self.received, len(self.states))
         observed = jnp.zeros(len(self.offsets), dtype=bool)
         return ClockBelief(gaussian=start, inputs=jnp.zeros(len(self.inputs)), silence=silence, observed=observed)
 
     @predicts
     def predict(self, state: ClockBelief, u: ArrayLike = (), k: Step = 0) -> ClockBelief:
-        """Predict plant and clocks over step k; each component's steps since it last arrived (`silence`) grow by 1."""
+        """Predict plant and clocks over step k.
+
+        The inputs are kept, since the test of observability in `correct` goes on along the motion under them. `silence`
+        counts the steps since each component of z last arrived, and grows by 1.
+        """
         predicted = self.base.predict(state.gaussian, u, k)
         return ClockBelief(
             gaussian=predicted, inputs=jnp.asarray(u, dtype=float), silence=state.silence + 1, observed=state.observed
@@ -112,7 +116,7 @@ class ClockFilter(AbstractWrapper):
         not observable get the gain 0: they keep mean and covariance, and the others are corrected in spite of them.
         """
         base = self.base
-        # Moments of the signal, and the expected measurement E[z] = M E[y] + b.
+        # Moments of the signal y = h(x) + v, and the expected measurement E[z] = M E[y] + b.
         channel: SecondOrder = at(base.channel, k)
         sensor, prior = at(base.sensor, k), state.gaussian
         signal = find_signal_moments(

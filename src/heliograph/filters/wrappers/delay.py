@@ -41,7 +41,10 @@ class PartFilter(AbstractWrapper):
     base: AbstractFilter
 
     def __init__(self, base: AbstractFilter, states: int):
-        """Wrap the filter `base` so that only its first `states` states are estimated."""
+        """Wrap the filter `base` so that only its first `states` states are estimated.
+
+        What its covariance is said to be (`claim`), its inputs, and the length of z (`received`) stay those of `base`.
+        """
         self.base, self.claim, self.states = base, base.claim, base.states[:states]
         self.inputs, self.received, self.kept = base.inputs, base.received, base.kept
 
@@ -119,7 +122,7 @@ class RelayLinesFilter(AbstractWrapper):
         return state
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
-        """Precompute all covariances and gains."""
+        """Return the filter with all covariances and gains computed for these inputs (horizon, inputs)."""
         return plan_filter(self, inputs, np.eye(len(self.states), len(self.base.states)))
 
 

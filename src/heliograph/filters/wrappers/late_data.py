@@ -46,13 +46,16 @@ class LateFilter(AbstractWrapper):
     delay: int = eqx.field(static=True)
 
     def __init__(self, base: AbstractFilter, delay: int):
-        """Wrap `base`, a filter of the link without delay, for measurements that arrive `delay` steps late."""
+        """Wrap `base`, a filter of the link without delay, for measurements that arrive `delay` steps late.
+
+        Claim (what the covariance is said to be), states, inputs and length of z (`received`) are those of `base`.
+        """
         self.base, self.delay, self.claim, self.states = base, delay, base.claim, base.states
         self.inputs, self.received = base.inputs, base.received
 
     @compile_on_call
     def init(self) -> LateState:
-        """Return the state before any signal was sent."""
+        """Return the state before step 0: the start of `base`, inputs of 0, and -1 as the last step."""
         start = jax.tree.map(jnp.asarray, self.base.init())
         return LateState(start, jnp.zeros((self.delay, len(self.inputs))), jnp.asarray(-1))
 
@@ -68,7 +71,7 @@ class LateFilter(AbstractWrapper):
         return LateState(predicted, inputs[1:], jnp.asarray(k, dtype=state.step.dtype))
 
     def _predict_if_begun(self, base: PyTree, u: jax.Array, k: jax.Array) -> PyTree:
-        """Predict over step k, or return the state as it is where k < 0."""
+        """Return the state of the filter `base` predicted over step k; unchanged if k < 0, before the first step."""
         after = self.base.predict(base, u, jnp.maximum(k, 0))
         return jax.tree.map(lambda new, old: jnp.where(k >= 0, new, old), after, base)
 
@@ -87,7 +90,7 @@ class LateFilter(AbstractWrapper):
 
     @estimates
     def estimate(self, state: LateState) -> Estimate:
-        """Return the prediction over the last `delay` steps."""
+        """Return the estimate of the present state: that of `delay` steps ago, predicted with the inputs since."""
 
         def predict_over(j: jax.Array, base: PyTree) -> PyTree:
             """Predict over the step j after that of the last signal."""
@@ -99,7 +102,7 @@ class LateFilter(AbstractWrapper):
         return self.base.estimate(present)
 
     def after_step(self, state: LateState, k: Step) -> Estimate:
-        """Return the prediction over the last `delay` steps."""
+        """Return the estimate of the state at step k, as `estimate` does."""
         return self.estimate(state)
 
 

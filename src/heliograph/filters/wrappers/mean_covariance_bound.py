@@ -30,7 +30,7 @@ from heliograph.random_affine.reported_numbers import FreshNumbers, FreshReading
 MOST = 20_000  # combinations of numbers that are summed over
 
 
-# Of a step: a filter's state, covariances by mode (modes, n, n), and the modes' law (modes,).
+# What is carried from step to step: a filter's state, covariances by mode (modes, n, n), and the modes' law (modes,).
 Carry = tuple[LinearBelief, jax.Array, jax.Array]
 
 

@@ -40,12 +40,12 @@ class AbstractWrapper(AbstractSizedFilter):
 
     @predicts
     def predict(self, state: PyTree, u: ArrayLike = (), k: Step = 0) -> PyTree:
-        """Predict with the base filter."""
+        """Predict over step k with the inputs u, by the base filter."""
         return self.base.predict(state, u, k)
 
     @corrects
     def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
-        """Correct with the base filter."""
+        """Correct with the measurement z of step k, by the base filter."""
         return self.base.correct(state, z, k)
 
     @estimates
