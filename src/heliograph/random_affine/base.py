@@ -84,7 +84,7 @@ class AbstractRandomAffine(Module):
         return any(affine.remembers for affine in inner_maps(self))
 
     def init(self, key: jax.Array) -> PyTree[jax.Array]:
-        """Draw the state before the first draw; it is () for a map that forgets, whose draws are independent."""
+        """Draw the state before the first draw; it is () for a map whose draws are independent over time."""
         memories_inside = memories(self)  # the memories of links inside, by identity
         if not memories_inside:
             return self._init(key)
@@ -102,7 +102,7 @@ class AbstractRandomAffine(Module):
         return draw_with_shared_memories(self, state, key_of_maps, keys)
 
     def _init(self, key: jax.Array) -> PyTree[jax.Array]:
-        """Draw the initial state of a map without memories inside; this default returns () for a map that forgets."""
+        """Draw the initial state of a map without memories inside; by default (), as of independent draws."""
         if self.remembers:
             raise fail(f"init of {type(self).__name__}", "one of its own, since it or a map inside remembers", "none")
         return ()
@@ -130,7 +130,7 @@ class AbstractRandomAffine(Module):
     def moments(self, order: int) -> JointMoments:
         """Return the nominal E[Sym^order(H)], which takes monomials of (y, 1) to means of those of (z, 1).
 
-        The map must forget. A map of your own may return the matrix alone.
+        Draws must be independent over time. A map of your own may return the matrix alone.
 
         Raises:
             ValueError: a matrix of more than the stated memory; a map that remembers, since the moments of one step

@@ -50,7 +50,10 @@ class AbstractDelayLine(AbstractMapWrapper):
         return self.line.draw(state, key)
 
     def moments(self, order: int) -> JointMoments:
-        """Return E[Sym^order(H)] of `line`, the map of the stacked signals."""
+        """Return E[Sym^order(H)] of `line`, the map of the stacked signals.
+
+        Sym^order(H) maps the monomials of (y, 1) of this degree to those of (z, 1).
+        """
         return self.line.moments(order)
 
 
@@ -98,7 +101,10 @@ class DelayLine(AbstractDelayLine):
         return f"{self.link.in_words() or DIRECT}, of the last {self.steps + 1} signals"
 
     def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
-        """Return the map with visit(name, hop, signal) in place of each hop of the link, which receives the line."""
+        """Return the map with visit(name, hop, signal) in place of each hop of the link, which receives the line.
+
+        A hop is a transmitter with its link. `position` has the name and number of the next one, and the signal there.
+        """
         plain, position = self.link.visit_hops(visit, position.on_delay_line(self.inputs // signal_size(self)))
         return replace_inner_maps(self, [plain]), position
 
@@ -169,7 +175,10 @@ class DelayedLink(AbstractDelayLine):
         return f"{self.link.in_words() or DIRECT}, {late}"
 
     def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
-        """Return the map with visit(name, hop, signal) in place of each hop of the link, and the position behind it."""
+        """Return the map with visit(name, hop, signal) in place of each hop of the link, and the position behind it.
+
+        A hop is a transmitter with its link. `position` has the name and number of the next one, and the signal there.
+        """
         link, position = self.link.visit_hops(visit, position)
         return replace_inner_maps(self, [link, self.delay]), position
 

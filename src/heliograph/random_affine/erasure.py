@@ -66,6 +66,8 @@ class Erasure(AbstractMapWrapper):
         """Return the erasure with visit(name, hop, signal) in place of each hop inside, and the position behind it.
 
         Hops send whether they are received or not, so that they receive the same signal as without the erasure.
+
+        A hop is a transmitter with its link. `position` has the name and number of the next one, and the signal there.
         """
         base, position = self.base.visit_hops(visit, position)
         return self.rebuilt(base), position

@@ -61,6 +61,8 @@ class AbstractHop(AbstractRandomAffine):
 
         The name is the position's prefix and "hop" with the hop's number in the chain; the signal is the second moment
         of what the hop receives. A wire, which does not transmit, is returned unchanged, with the same position.
+
+        A hop is a transmitter with its link. `position` has the name and number of the next one, and the signal there.
         """
         if not self.transmits:
             return self, position
@@ -111,7 +113,10 @@ class GainAndNoise(AbstractHop):
 
     @cache_by_object
     def moments(self, order: int) -> JointMoments:
-        """Return E[Sym^order(H)] = sum_k E[g^k] B_k: moments of the gain g, and B_k the `gain_coefficients`."""
+        """Return E[Sym^order(H)] = sum_k E[g^k] B_k: moments of the gain g, and B_k the `gain_coefficients`.
+
+        Sym^order(H) maps the monomials of (y, 1) of this degree to those of (z, 1).
+        """
         gains = tabulate_gain_moments(self.law, order)
         coefficients = self.gain_coefficients(order)
         return JointMoments(

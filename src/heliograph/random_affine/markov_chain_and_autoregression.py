@@ -89,14 +89,15 @@ class AbstractMemory(Module):
         raise unwritten(self, "state_from_number")
 
     def next_state_quadrature(self, state: jax.Array | None, degree: int) -> tuple[jax.Array | np.ndarray, Law]:
-        """Return the points and weights for the next state's law given this one (None: for the law at the first use).
+        """Return points and weights of a quadrature of the next state s+ given the present `state`.
 
-        Exact for polynomials of twice the `degree` in the state.
+        E[f(s+)] = sum_i weight_i f(point_i), exact for polynomials f of up to twice the `degree`. If `state` is None,
+        the quadrature is for the law of the first state.
         """
         raise unwritten(self, "next_state_quadrature")
 
     def labelled(self, label: str) -> "AbstractMemory":
-        """Return a copy without a name, which only `label` identifies."""
+        """Return a copy without a name, with `label` as identity: only copies of this label share its state."""
         labelled_copy = copy(self)  # a construction would check numbers that may be stacked over time
         object.__setattr__(labelled_copy, "name", None)  # fields are frozen
         object.__setattr__(labelled_copy, "identity", label)
@@ -336,7 +337,7 @@ def _hermite_quadrature(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def unique_memories(all_memories: Iterable[AbstractMemory]) -> dict[str, AbstractMemory]:
-    """Return the memories by identity, each once, in order of appearance.
+    """Return the memories in order of appearance, each once, by their identities (texts by which maps share them).
 
     Raises:
         ValueError: memories of one identity (of one name) that differ.

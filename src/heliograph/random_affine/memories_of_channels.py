@@ -72,7 +72,11 @@ def draw_with_shared_memories(
 
 
 def memories(channel: PyTree) -> dict[str, AbstractMemory]:
-    """Return the memories on which the modes of a map (or of all maps in a tree) depend, by identity, in order."""
+    """Return the memories on which the maps in a channel (or in any tree of models) depend, in order of appearance.
+
+    The key is the memory's identity, a text. Maps whose memories have one identity share one state, so that such a
+    memory is listed once.
+    """
     parts = jax.tree.leaves(channel, is_leaf=is_memory_dependent)
     return unique_memories(leaf.memory for leaf in parts if is_memory_dependent(leaf))
 
@@ -111,7 +115,8 @@ def drop_names(channel: T) -> T:
 def number_unnamed_memories(model: T) -> T:
     """Return the model with its unnamed memories identified by numbers instead of random texts.
 
-    So models that differ only in these texts become equal.
+    The identity of a memory is the text by which maps share it; without a name it is random. So models that differ only
+    in these texts become equal.
     """
     numbered = enumerate(memories(model).items())
     labelled = {key: memory.labelled(f"unnamed {i}") for i, (key, memory) in numbered if memory.name is None}
@@ -160,7 +165,7 @@ def replace_memories(channel: T, replacements: Mapping[str, AbstractMemory]) -> 
     """Return the map with some memories replaced: `replacements` has the new memory by the identity of the old one."""
 
     def replace(leaf: PyTree) -> PyTree:
-        """Return a map with its memory replaced; return anything else unchanged."""
+        """Return a model with its memory replaced, if a new one is given; return anything else unchanged."""
         if not is_memory_dependent(leaf) or leaf.memory.identity not in replacements:
             return leaf
         return eqx.tree_at(lambda m: m.memory, leaf, replacements[leaf.memory.identity])

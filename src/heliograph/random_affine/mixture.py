@@ -54,7 +54,10 @@ class Mixture(AbstractOneOfSeveralMaps, AbstractCombination):
 
     @cache_by_object
     def moments(self, order: int) -> JointMoments:
-        """Return sum_i p_i E[Sym^order(H_i)], p_i the probability of map i."""
+        """Return E[Sym^order(H)] = sum_i p_i E[Sym^order(H_i)], p_i the probability of map i.
+
+        Sym^order(H) maps the monomials of (y, 1) of this degree to those of (z, 1).
+        """
         check_forgets("moments of a map", self)
         matrices = [affine.moments(order).matrix for affine in self.maps]
         probabilities = self.choice.probabilities

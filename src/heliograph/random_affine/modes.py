@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from functools import reduce
 from itertools import product
 from math import prod
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -50,7 +51,7 @@ class Modes(AbstractOneOfSeveralMaps, AbstractModal):
     maps: tuple[AbstractRandomAffine, ...]
 
     def __init__(self, chain: MarkovChain, maps: Sequence[AbstractRandomAffine]):
-        """Hold the Markov chain and one memoryless map for each of its modes."""
+        """Hold the Markov chain and one map for each of its modes, all of one shape and without memory of their own."""
         if not isinstance(chain, MarkovChain):
             raise fail("chain", "a MarkovChain", show_value(chain))
         self.memory, self.maps = chain, check_maps("maps of the modes", maps)
@@ -99,7 +100,7 @@ class _MapOfTracedIndex(AbstractOneOfSeveralMaps):
         return jnp.stack([m.sample(key) for m in self.maps])[self.index]
 
     def moments(self, order: int) -> JointMoments:
-        """Return E[Sym^order(H)] of maps[index], by computing it for every map."""
+        """Return the moments of maps[index], by computing those of every map."""
         matrices = [jnp.asarray(m.moments(order).matrix) for m in self.maps]
         return JointMoments(jnp.stack(matrices)[self.index], self.outputs, self.inputs, order)
 
@@ -170,7 +171,10 @@ class OneStepLate(AbstractMapWrapper):
         return self.base.carry_angles(sent)
 
     def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
-        """Return the map with visit(name, hop, signal) in place of each hop of `base`, and the position behind it."""
+        """Return the map with visit(name, hop, signal) in place of each hop of `base`, and the position behind it.
+
+        A hop is a transmitter with its link. `position` has the name and number of the next one, and the signal there.
+        """
         base, position = self.base.visit_hops(visit, position)
         return self.rebuilt(base), position
 
@@ -278,12 +282,7 @@ def joint_modes(
     total = prod(len(chain.initial) for chain in chains)
     if total > MODES:
         raise fail("memories of a channel", f"at most {MODES:,} modes together", f"{total:,}")
-    xp = library(chains)
-    # Independent memories: their laws multiply.
-    initial = reduce(xp.kron, [chain.initial for chain in chains], np.ones(1))
-    transition = reduce(xp.kron, [chain.transition for chain in chains], np.ones((1, 1)))
-    # Upper end of each joint transition probability: the product of the upper ends.
-    largest = reduce(xp.kron, [chain.transition + chain.radius for chain in chains], np.ones((1, 1)))
+    joint = _combine_independent_chains(chains)
     # The state of each memory in each joint mode, and the maps given these.
     states_by_mode = [
         dict(zip(by_identity, [state.item() for state in states], strict=True))
@@ -293,12 +292,28 @@ def joint_modes(
     for m in maps:
         check_forgets("channel of a filter", m)
     return JointModes(
-        initial=initial,
-        transition=transition,
-        radius=largest - transition,
+        *joint,
         maps=maps,
         beside=tuple(condition_on_states(beside, states) for states in states_by_mode),
     )
+
+
+class _JointChain(NamedTuple):
+    """Initial law, transition and its radius of uncertainty of several chains together."""
+
+    initial: Law
+    transition: Rows
+    radius: Rows
+
+
+def _combine_independent_chains(chains: Sequence[MemoryStates]) -> _JointChain:
+    """Return the chain of all combinations of one state of each independent chain: probabilities are multiplied."""
+    xp = library(chains)
+    initial = reduce(xp.kron, [chain.initial for chain in chains], np.ones(1))
+    transition = reduce(xp.kron, [chain.transition for chain in chains], np.ones((1, 1)))
+    # Upper end of each joint transition probability: the product of the upper ends.
+    largest = reduce(xp.kron, [chain.transition + chain.radius for chain in chains], np.ones((1, 1)))
+    return _JointChain(initial, transition, largest - transition)
 
 
 def _represent_memory_by_nodes(memory: AbstractMemory, degree: int, nodes: int | None) -> MemoryStates:

@@ -57,8 +57,9 @@ class Rotation(AbstractRandomAffine):
     def moments(self, order: int) -> JointMoments:
         """Return E[Sym^k(H)] = Sym^k(C)^-1 diag(exp(-(p - q)^2 deviation^2 / 2)) Sym^k(C), k = `order`.
 
-        C takes (y_1, y_2) to w = y_1 + i y_2 and its conjugate v. A turn by phi multiplies w^p v^q by
-        exp(i (p - q) phi), whose mean is the factor on the diagonal.
+        Sym^k(H) maps the monomials of (y, 1) of degree k to those of (z, 1). C takes (y_1, y_2) to w = y_1 + i y_2 and
+        its conjugate v. A turn by phi multiplies w^p v^q by exp(i (p - q) phi), whose mean is the factor on the
+        diagonal.
         """
         turns = np.array([p - q for p, q, _ in list_exponents(3, order)])
         factors = library(self.deviation).exp(-(turns**2) * self.deviation**2 / 2)

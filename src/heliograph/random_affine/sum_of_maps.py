@@ -145,11 +145,17 @@ class Superposed(AbstractCombination):
 
     @cache_by_object
     def corner_moments(self, order: int) -> Corners:
-        """Return E[Sym^order(H)] for each combination of one extreme law ("corner") of each map."""
+        """Return E[Sym^order(H)] for each combination of one extreme law ("corner") of each map.
+
+        Sym^order(H) maps the monomials of (y, 1) of this degree to those of (z, 1).
+        """
         return self._add_moments([m.corner_moments(order) for m in self.maps], order)
 
     def _interval_of_parts(self, order: int) -> Interval:
-        """Return an interval of each entry of E[Sym^order(H)], from those of the equal map [I ... I] after a stack."""
+        """Return an interval of each entry of E[Sym^order(H)], found for the equal map: a sum [I ... I] after a stack.
+
+        Sym^order(H) maps the monomials of (y, 1) of this degree to those of (z, 1).
+        """
         return self.as_stack.moment_interval(order)
 
     def covers_kind(self, actual: AbstractRandomAffine, same_noise: SameNoise) -> bool:
@@ -198,6 +204,8 @@ class Superposed(AbstractCombination):
 
         Each map is a link that takes some components of y, and names of its hops begin with "link" and its number.
         Links side by side are not hops of the chain, so that the position does not change.
+
+        A hop is a transmitter with its link. `position` has the name and number of the next one, and the signal there.
         """
         maps_and_positions = zip(position.number_maps(self.maps, "link"), self.places, strict=True)
         visited = [

@@ -296,7 +296,7 @@ def give_moments(own_method: Callable[[Any, int], Any]) -> Callable[[Any, int], 
 
     @wraps(own_method)
     def moments(channel: Any, order: int) -> JointMoments:
-        """Return the moments of this order, from the `JointMoments` or the matrix that the map's own method returns."""
+        """Return E[Sym^order(H)] of a map as `JointMoments`, where its own method may return the matrix alone."""
         result = own_method(channel, order)
         if isinstance(result, JointMoments):
             return result

@@ -37,9 +37,11 @@ Array2 = Float[jax.Array | np.ndarray, "n m"]
 
 @singledispatch
 def push_moments(channel: AbstractRandomAffine, order: int, moments: Array1) -> Array1:
-    """Return E[mono_order(z)] from E[mono_order(y)], for y independent of the map.
+    """Return all moments of z = G y + n up to `order`, from the same `moments` of y, which is independent of G and n.
 
-    The same numbers as `channel.moments(order).expect(moments)`, which is what a map of no known structure does.
+    They are the means of the monomials of total degree k = `order` in (z, 1), and in (y, 1), in the order of
+    `list_exponents`. Maps of known structure have methods that need less memory; this one, for any other map,
+    multiplies by the matrix E[Sym^k(H)].
 
     Shapes: moments (C(inputs + k, k),) -> (C(outputs + k, k),).
     """
@@ -104,7 +106,7 @@ class TabulatedNoise(AbstractNoise):
     order: int = eqx.field(static=True)
 
     def __init__(self, source: AbstractNoise, order: int):
-        """Compute the table of the noise's moments up to `order`; `source` is the noise itself."""
+        """Compute all moments of the noise `source` up to `order`, and hold them as a table."""
         self.mean, self.covariance, self.source = source.mean, source.covariance, source
         self.table, self.order = noise_moment_vector(source, order), order
 

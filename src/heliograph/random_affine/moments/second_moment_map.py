@@ -64,10 +64,10 @@ def signal_of_map(bound: QuadraticMap) -> QuadraticMap:
 
 
 def size_of_map(moment_map: QuadraticMap) -> Any:
-    """Return the root of the trace of the map's upper bound at W = I, sqrt(sum_ia (C + R)_iiaa): one number.
+    """Return the size of a bound, one number: sqrt(sum_ia (C + R)[i, i, a, a]), with C its `center` and R its `radius`.
 
-    C is `center`, and R `radius`. The number weighs bounds of several maps that are added. Any positive weights give a
-    valid bound, so that it has no derivative.
+    This is the root of the trace of the bound at W = I. By it bounds of several maps are weighed when they are added.
+    Any positive weights give a valid bound, so that JAX takes it as constant.
     """
     largest = stop_gradient(moment_map.center + moment_map.radius)
     return library(largest).sqrt(library(largest).einsum("iiaa->", largest))

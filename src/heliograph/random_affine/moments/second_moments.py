@@ -264,19 +264,14 @@ def _bound_stacked_maps(channel: Stack) -> list[QuadraticMap]:
     different maps, which are independent, it is D_i Y Y' D_j', D_i = E_v[H_i] - M_i, with |D_i| at most the `reach` of
     map i in each entry. A bound has a center, and a radius for each entry.
     """
-    n, mean = channel.outputs, channel.moments(1).mean[:-1]
-    blocks: list[list[QuadraticMap]] = []  # (spread, shift, power) of each part
-    reaches = []
-    start = 0  # first output of the part
+    mean = channel.moments(1).mean[:-1]  # E[(G, n)]: H without its last row (0, 1)
+    spreads, shifts, powers, reaches = list[QuadraticMap](), list[QuadraticMap](), list[QuadraticMap](), []
+    start = 0  # first output of the map
     for affine in channel.maps:
-        stop = start + affine.outputs
-        # Diagonal block, and the largest |E[H_i] - M_i| under any law.
-        moments = second_order(affine)
-        low, high = affine.moment_interval(1)
-        xp = library(low, high, mean)
-        to_high, to_low = high[:-1] - mean[start:stop], low[:-1] - mean[start:stop]
-        reaches.append(xp.maximum(xp.abs(to_high), xp.abs(to_low)))
-        blocks.append([place_on_diagonal(q, start, n) for q in (moments.spread, moments.shift, moments.power)])
+        moments, stop = second_order(affine), start + affine.outputs
+        for bounds, bound in ((spreads, moments.spread), (shifts, moments.shift), (powers, moments.power)):
+            bounds.append(place_on_diagonal(bound, start, channel.outputs))
+        reaches.append(_find_reach_of_mean(affine, mean[start:stop]))
         start = stop
     part_of_output = np.repeat(np.arange(len(channel.maps)), [affine.outputs for affine in channel.maps])
     off_diagonal = (part_of_output[:, None] != part_of_output[None, :])[:, :, None, None]
@@ -285,15 +280,24 @@ def _bound_stacked_maps(channel: Stack) -> list[QuadraticMap]:
     reach, size = xp.concatenate(reaches), xp.abs(mean)
     cross = symmetric_product(reach, reach)
     power_cross = drop_constant(symmetric_product(size, reach) + symmetric_product(reach, size) + cross)
-    # Center and radius of the entries off the diagonal, of spread, shift and power in turn.
-    centers = (0.0, 0.0, drop_constant(symmetric_product(mean, mean)))
-    radii = (cross, cross, power_cross)
-    return [
-        QuadraticMap(
-            sum(q.center for q in maps) + off_diagonal * center, sum(q.radius for q in maps) + off_diagonal * radius
+
+    def join(blocks: list[QuadraticMap], center: Tensor | float, radius: Tensor) -> QuadraticMap:
+        """Return the bound with these diagonal blocks, and with `center` and `radius` in all other entries."""
+        return QuadraticMap(
+            sum(q.center for q in blocks) + off_diagonal * center, sum(q.radius for q in blocks) + off_diagonal * radius
         )
-        for maps, center, radius in zip(zip(*blocks, strict=True), centers, radii, strict=True)
-    ]
+
+    power_of_mean = drop_constant(symmetric_product(mean, mean))
+    return [join(spreads, 0.0, cross), join(shifts, 0.0, cross), join(powers, power_of_mean, power_cross)]
+
+
+def _find_reach_of_mean(affine: AbstractRandomAffine, mean: Matrix) -> Matrix:
+    """Return the largest |E_v[(G, n)] - M| of each entry under any possible law v; M is the nominal `mean`."""
+    low, high = affine.moment_interval(1)
+    xp = library(low, high, mean)
+    to_high, to_low = high[:-1] - mean, low[:-1] - mean  # without the last row of E[H], (0, 1)
+    reach: Matrix = xp.maximum(xp.abs(to_high), xp.abs(to_low))
+    return reach
 
 
 def _compute_mean_and_covariance(channel: AbstractRandomAffine) -> tuple[Matrix, Tensor]:

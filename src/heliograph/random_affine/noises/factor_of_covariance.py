@@ -16,7 +16,7 @@ FACTOR_TOLERANCE = 1e-10  # allowed |A A' - S|_ij, as a share of the product of 
 
 
 def factor_by_eigenvectors(covariance: np.ndarray) -> np.ndarray:
-    """Return A with A A' = S from eigenvectors of S, or of its correlations where S loses digits of small components.
+    """Return A with A A' = S, from eigenvectors of S, or of the correlations if S has components of other sizes.
 
     Eigenvalues are exact to rounding of the largest one, so that a component in small units would be lost. An
     eigenvalue below that rounding is set to zero, since its root of about 1e-8 would add noise to combinations that
@@ -61,8 +61,12 @@ class WeightsOfFactor:
         return noise.__dict__["weights"]
 
     def __set__(self, noise: Any, weights: Any) -> None:
-        """Hold the weights, and factor the covariance where the factor is that of another one."""
-        held = noise.__dict__
+        """Hold the weights w; factor the covariance anew if A (`factor`) and w are not those of this covariance.
+
+        They are not if JAX or Equinox made the noise anew with another covariance. Numbers are compared. Of a traced
+        factor nothing is known but the covariance object with which it came first.
+        """
+        held = noise.__dict__  # the fields of the noise by name
         held["weights"] = weights
         covariance, factor = held.get("covariance"), held.get("factor")
         found_factor, found_covariance = self._found.get(id(factor), (None, None))
@@ -73,7 +77,7 @@ class WeightsOfFactor:
             S = np.asarray(covariance)
             if self._belongs_to(np.asarray(factor), np.asarray(weights), S):
                 self._note(factor, covariance)
-            else:
+            else:  # one covariance (n, n), or several along leading axes
                 n = S.shape[-1]
                 held["factor"] = np.reshape([self.factor(one) for one in S.reshape(-1, n, n)], S.shape)
                 held["weights"] = np.ones(S.shape[:-1])
