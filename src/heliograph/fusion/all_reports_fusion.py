@@ -237,15 +237,25 @@ def correct_with_reports(
     innovation = jnp.where(is_present, values - expected, 0.0)
     slopes = jnp.asarray(output @ x.root)
     corrected = correct_by_gain(x, slopes, noise, gain, innovation)
-    # Quantizers' part v of the error: v+ = (I - K C) v - K G mu. Outer products v v' are bounded: of the first term as
-    # a linear map does, of the second by Cauchy's inequality, and of the sum by Young's inequality.
     quantizer_bound = None
     if state.quantizer_bound is not None:
-        remaining = propagate_by_mode(jnp.eye(len(x.mean)) - gain @ output, state.quantizer_bound, 0.0)
-        added = _bound_by_cauchy(gain @ _place_on_diagonal(past.gain), jnp.ravel(past.error))
-        quantizer_bound = symmetric(_bound_by_young(remaining, added))
+        quantizer_bound = _correct_quantizer_bound(state.quantizer_bound, gain, output, past)
     report_law = PredictedReports(expected, join_columns(WeightedColumns(slopes, x.variances), noise).covariance)
     return ReportsBelief(corrected, past, quantizer_bound), report_law
+
+
+def _correct_quantizer_bound(
+    bound: Float[jax.Array, "N N"], gain: Float[jax.Array, "N M"], output: Float[jax.Array, "M N"], past: PastReports
+) -> Float[jax.Array, "N N"]:
+    """Return a matrix above v+ v+' after a correction, from `bound`, one above v v' before it.
+
+    v is the part of the centre's error that quantizers cause: v+ = (I - K C) v - K G mu, with the gain K, the `output`
+    matrix C, the links' gains G and the quantizers' errors |mu| <= `past.error`. The first term is bounded as a linear
+    map does, the second by Cauchy's inequality, and the sum by Young's.
+    """
+    remaining = propagate_by_mode(jnp.eye(len(bound)) - gain @ output, bound, 0.0)
+    added = _bound_by_cauchy(gain @ _place_on_diagonal(past.gain), jnp.ravel(past.error))
+    return symmetric(_bound_by_young(remaining, added))
 
 
 def _compute_gain(
@@ -339,9 +349,10 @@ def _factor_measurement_noise(gain: Float[jax.Array, "node n m"], noise: Array) 
 
 
 def _factor_each(noise: Float[jax.Array, "age node m m"]) -> WeightedColumns:
-    """Return the factors of the joint covariance of all reports' noises, which are independent of each other.
+    """Return factors L diag(d) L' of the joint covariance of the noises of all reports, which are independent.
 
-    It is block-diagonal, age after age and node after node.
+    `noise` has the covariance (m, m) of each report. Their joint one is block-diagonal, age after age and node after
+    node, and so is L.
     """
     ages, nodes, m, _ = noise.shape
     blocks = jax.vmap(eliminate)(noise.reshape(ages * nodes, m, m))

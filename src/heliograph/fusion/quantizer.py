@@ -81,7 +81,7 @@ class AbstractQuantizer(Module):
         )
 
     def check(self, n: int) -> None:
-        """Raise ValueError unless the parameters fit values of n components."""
+        """Raise ValueError unless each parameter is one number or has one for each of n components."""
         for leaf in jax.tree.leaves(self):
             if np.shape(leaf) not in ((), (n,)):
                 raise fail("quantizer", f"numbers or shape ({n},) for each parameter", f"shape {np.shape(leaf)}")
@@ -107,26 +107,30 @@ Parameter = Float[Array, "..."]  # one number for all components, or one for eac
 
 
 def find_segment(x: Float[jax.Array, "*n"], amplitude: Parameter, levels: Float[Array, ""]) -> Float[jax.Array, "*n"]:
-    """Return the index, from 0, of the segment of [-amplitude, amplitude] that holds x."""
+    """Return the index s = 0, ..., levels - 1 of the segment of [-amplitude, amplitude] that holds x.
+
+    The interval is divided in `levels` equal segments. A value outside gets the first or the last one.
+    """
     return jnp.clip(jnp.floor((x / amplitude + 1) * levels / 2), 0, levels - 1)
 
 
 def midpoint(segment: Array, amplitude: Parameter, levels: Float[Array, ""]) -> Float[jax.Array, "*n"]:
-    """Return the midpoint of a segment; exactly zero for the middle one of an odd number.
+    """Return the midpoint (2 s + 1 - L) / L d of segment s = 0, ..., L - 1, of L = `levels` that divide [-d, d].
 
-    The quotient comes first: the product with many levels could overflow.
+    d is the `amplitude`. The middle one of an odd number of segments has exactly the midpoint 0.
     """
+    # The quotient comes first: the product with many levels could overflow.
     return jnp.asarray((2 * segment + 1 - levels) / levels * amplitude)
 
 
 def check_levels(value: int) -> Float[np.ndarray, ""]:
-    """Return the number of segments, at least two, as a float."""
+    """Return the number of segments as a float array (); raise ValueError unless it is a whole number from 2."""
     check_count("levels", value, 2)
     return np.asarray(value, dtype=np.float64)
 
 
 def check_parameter(name: str, value: ArrayLike) -> Parameter:
-    """Return a parameter as a number, or as one number per component."""
+    """Return a parameter as an array: () for one number that all components have, (n,) for one of each component."""
     is_list = isinstance(value, Sequence) or rank(name, value) > 0
     numbers: Parameter = array(name, value, (None,) if is_list else ())
     return numbers
