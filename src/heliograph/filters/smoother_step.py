@@ -258,10 +258,11 @@ def smoother_step_of(
 
 
 def make_smoother_step(filter: Any, trace: StepTrace) -> SmootherStep:
-    """Return a filter's smoother step, with the NIS of its innovation and with no stronger claim than the filter's.
+    """Return what a backward pass needs of one step of a filter, with the NIS of the step's innovation.
 
-    A filter may return the smoother step of a filter inside it, with that filter's claim. The NIS is e' S^-1 e of the
-    innovation e with covariance S, and `count` the number of components that arrived.
+    The NIS is e' S^-1 e of the innovation e with covariance S, and `count` the number of components that arrived. A
+    filter may return the smoother step of a filter inside it: what its covariance is said to be (`claim`) is then made
+    no stronger than the filter's own claim.
     """
     step: SmootherStep = filter.smoother_step(trace)
     nis, count = innovation_distance(trace.innovation)

@@ -42,10 +42,9 @@ def split_by_obligation(
     Returns:
         The parts of `status` where the rule decides, and where it must send; they sum to `status`.
     """
-    if heartbeat is None:
-        heartbeat = -1  # a number of steps that never occurs
+    longest_silence = -1 if heartbeat is None else heartbeat  # -1 steps never occur
     ages = jnp.arange(status.shape[2])
-    is_heartbeat = (ages == heartbeat)[:, None]  # along the axis of steps since it sent
+    is_heartbeat = (ages == longest_silence)[:, None]  # along the axis of steps since it sent
     must_send = jnp.where(~has_sent | is_heartbeat, status, 0.0)
     return status - must_send, must_send
 

@@ -115,7 +115,10 @@ def scan_inside_jit(
     u: Float[Array, "steps inputs"],
     output: Callable[[PyTree, Innovation, jax.Array], PyTree],
 ) -> PyTree:
-    """Step a filter over rows inside a compiled computation; return output(state, innovation, k) of all rows."""
+    """Step a filter over rows inside a compiled computation, without checks; return the outputs of all rows, stacked.
+
+    The output of row k is output(state after it, innovation, k).
+    """
     _, outputs = scan_with_last_state(filter, z, u, output)
     return outputs
 
@@ -254,13 +257,19 @@ def _step_alone(filter: Any, state: PyTree, z: Array, u: Array, k: Array) -> tup
 
 
 def _begin(fixed: tuple[Any, ...]) -> PyTree:
-    """Return the state before the first row: the one that is given with the filter, or else the filter's own."""
+    """Return the state before the first row: the given one, or else the filter's own.
+
+    `fixed` is what is the same for all rows: filter, output function, and perhaps the first state and row number.
+    """
     filter, _, *start = fixed
     return jax.tree.map(jnp.asarray, start[0] if start else filter.init())
 
 
 def _step(fixed: tuple[Any, ...], state: PyTree, row: tuple[Array, ...]) -> tuple[PyTree, PyTree]:
-    """Return the state after a row (number, measurement, input), and what is kept of the row."""
+    """Return the state after a row (number, measurement, input), and the row's output.
+
+    `fixed` is what is the same for all rows: filter, output function, and perhaps the first state and row number.
+    """
     filter, output, *_ = fixed
     k, z, u = row
     after, innovation = filter.correct(filter.predict(state, u, k), z, k)
@@ -268,7 +277,7 @@ def _step(fixed: tuple[Any, ...], state: PyTree, row: tuple[Array, ...]) -> tupl
 
 
 def _make_end_origin(filter: SteppedFilter, state: PyTree, end: int, u: Array, dates: np.ndarray | None) -> Origin:
-    """Return where a record ends, from which a later call or a forecast goes on.
+    """Return the end of a run, from which a later run or a forecast goes on: state, step, last inputs, last time.
 
     Args:
         filter: the filter.
@@ -321,7 +330,7 @@ def _find_origin_of_earlier_result(filter: SteppedFilter, after: Filtered) -> Or
 
 
 def _check_dates_increase(before: Origin, dates: np.ndarray) -> None:
-    """Check that dates of rows are behind that of the last row before them, where it has one."""
+    """Raise ValueError unless the first date is after that of the last row before, if that row has a date."""
     if isinstance(before.time, np.datetime64) and not dates[0] > before.time:
         raise fail("measurements", f"rows behind {before.time}, the last one before them", str(dates[0]))
 

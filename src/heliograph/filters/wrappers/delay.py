@@ -241,7 +241,10 @@ def _build_behind_relays(plant: AnyPlant, sensor: AnySensor, channel: Channel, m
 
 
 def deliver_line_as_current(channel: Channel) -> Channel:
-    """Return the channel for a filter that takes late signals for current ones: its delay line holds y_k everywhere."""
+    """Return the channel as it is to a filter that takes late signals for current ones.
+
+    A late channel is a map of the delay line (y_k, y_k-1, ...) of the last signals. Here all its entries are y_k.
+    """
     current: Channel = at_each_step(_deliver_at_once, channel)
     return current
 

@@ -157,18 +157,11 @@ def _list_told_numbers(filter: ToldFilter) -> ToldNumbersByMode:
     memories = [affine.memory for affine in list_told_maps(first(filter.link))]
     chains = [memory for memory in memories if isinstance(memory, MarkovChain)]
     if chains:
-        varies = np.ndim(chains[0].transition) > 2  # a transition matrix for each step
-        if len(memories) > 1 or chains[0].is_uncertain or varies:
+        chain = chains[0]
+        varies = np.ndim(chain.transition) > 2  # a transition matrix for each step
+        if len(memories) > 1 or chain.is_uncertain or varies:
             raise fail("numbers told", "one chain alone, of known probabilities", f"{len(memories)} maps")
-        # In mode i the number i is reported with weight 1: shapes (modes, 1, 1) and (modes, 1).
-        modes = chains[0].modes
-        numbers = np.arange(float(modes))[:, None, None]
-        return ToldNumbersByMode(
-            numbers=numbers,
-            weights=np.ones((modes, 1)),
-            initial=np.asarray(chains[0].initial),
-            transition=np.asarray(chains[0].transition),
-        )
+        return _list_numbers_of_chain(chain)
     # All combinations so far with each number of the next map: rows of `values`; their weights are products.
     values, weights = np.zeros((1, 0)), np.ones(1)
     for memory in memories:
@@ -179,6 +172,17 @@ def _list_told_numbers(filter: ToldFilter) -> ToldNumbersByMode:
         weights = np.outer(weights, chances).ravel()
     return ToldNumbersByMode(
         numbers=values[None], weights=weights[None], initial=np.ones(1), transition=np.ones((1, 1))
+    )
+
+
+def _list_numbers_of_chain(chain: MarkovChain) -> ToldNumbersByMode:
+    """Return the numbers that messages report of a chain's mode: in mode i the number i, with weight 1."""
+    numbers = np.arange(float(chain.modes))[:, None, None]  # (modes, nodes, told), one node and one number
+    return ToldNumbersByMode(
+        numbers=numbers,
+        weights=np.ones((chain.modes, 1)),
+        initial=np.asarray(chain.initial),
+        transition=np.asarray(chain.transition),
     )
 
 
