@@ -321,7 +321,8 @@ def step_with_judgement(
     after, innovation = filter.correct(prior, z, k)
     estimate = filter.after_step(after, k)
     estimates = filter.estimate(state), filter.estimate(prior), estimate
-    spoilt, used = do_inputs_spoil(filter, filter.inputs, u, k), filter.angles_used()
+    spoilt = do_inputs_spoil(filter, filter.inputs, u, k)
+    used = filter.angles_used()
     judgement = judge_step(filter.claim, (state, prior, after), estimates, innovation, z, filter.of_atoms, used, spoilt)
     return after, estimate, judgement, innovation
 

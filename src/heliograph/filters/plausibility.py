@@ -123,7 +123,7 @@ class Judgement(NamedTuple):
 
     @staticmethod
     def find_far(innovation: Innovation) -> jax.Array:
-        """Return which components of the innovation e, of covariance S, are far: |e_j| > LIMIT sqrt(S_jj), LIMIT 1e6."""
+        """Return which components of the innovation e, of covariance S, are far: |e_j| > 1e6 sqrt(S_jj)."""
         variances = jnp.diagonal(jnp.asarray(innovation.covariance))
         return jnp.abs(innovation.value) > LIMIT * jnp.sqrt(jnp.maximum(variances, 0.0))
 

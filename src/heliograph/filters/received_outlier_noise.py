@@ -82,12 +82,15 @@ class ReceivedNoise(Module):
         filter counts Var(g) y^2 with the signal, so the branch adds E[g] m_j and E[g^2] r_j + Var(g) m_j (m_j + 2 y),
         which may be negative: the sum with Var(g) y^2 is at least E[g^2] r_j. The last hop's noise is added to both.
         """
-        gain, power, mean = self.gain[:, None], self.power[:, None], self.mean
+        gain = self.gain[:, None]
+        power = self.power[:, None]
+        mean = self.mean
         signal = (self.output @ sensor_mean)[:, None]  # y
         least = power * self.variance + self.late_variance
         # Var(g) m_j (m_j + 2 y), with Var(g) = E[g^2] - E[g]^2.
         squared_gain, twice_signal = gain**2, 2 * signal
-        gain_variance, mean_and_signal = power - squared_gain, mean + twice_signal
+        gain_variance = power - squared_gain
+        mean_and_signal = mean + twice_signal
         by_gain_variance = gain_variance * mean * mean_and_signal
         return NoiseBranches(
             log_share=jnp.asarray(self.log_share),

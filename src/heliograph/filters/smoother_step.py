@@ -199,7 +199,8 @@ class SmootherStep(Module):
         """
         mean, columns = law.mean, law.columns
         if self.projection is not None:
-            mean, columns = self.projection @ mean, columns.through(self.projection)
+            mean = self.projection @ mean
+            columns = columns.through(self.projection)
         mean = mean if self.offset is None else mean + self.offset
         if self.limits:
             from heliograph.filters.truncation import hold_mean_within_limits, truncate_to_limits

@@ -159,7 +159,8 @@ class ReportMap(NamedTuple):
         zeta = (x, errors e_i of the nodes). A report is x - e_i; past reports follow zeta, the latest first.
         """
         nodes, n, _ = self.transition.errors.shape
-        zeta, past_reports = columns[: (1 + nodes) * n], columns[(1 + nodes) * n :]
+        zeta = columns[: (1 + nodes) * n]
+        past_reports = columns[(1 + nodes) * n :]
         zeta_after = self.transition @ zeta
         if not len(past_reports):
             return zeta_after
@@ -179,7 +180,8 @@ def propagate_errors(state: ReportsBelief, centre_step: CentreStep, links: Repor
     """
     step, errors = centre_step
     nodes, n, _ = step.gain.shape
-    state_size, zeta_size = len(state.gaussian.mean), len(step.offset)  # the state is zeta and past reports
+    state_size = len(state.gaussian.mean)  # of zeta and past reports
+    zeta_size = len(step.offset)
     # Noise of zeta. B w is common to x and all errors. K nu reaches the errors alone: `behind_x` puts it behind x. A
     # third part covers rounding errors, in proportion to E[x x'].
     behind_x = np.eye(zeta_size, nodes * n, -n)
@@ -229,10 +231,14 @@ def correct_with_reports(
         The corrected state, and the mean and covariance of the reports before they arrived.
     """
     # C, the expected reports C s + c, and the filter's gain K, in which rows that did not arrive count nothing.
-    x, past, values = state.gaussian, state.past, jnp.ravel(reports)
+    x = state.gaussian
+    past = state.past
+    values = jnp.ravel(reports)
     output = _make_output_matrix(past, len(x.mean))
-    expected, is_present = output @ x.mean + jnp.ravel(past.offset), ~jnp.isnan(values)
-    noise, gain = _factor_each(past.noise), _compute_gain(x, output, past, is_present)
+    expected = output @ x.mean + jnp.ravel(past.offset)
+    is_present = ~jnp.isnan(values)
+    noise = _factor_each(past.noise)
+    gain = _compute_gain(x, output, past, is_present)
     # Innovation z - (C s + c), and the error after the correction without quantizers, (I - K C) e - K n.
     innovation = jnp.where(is_present, values - expected, 0.0)
     slopes = jnp.asarray(output @ x.root)
@@ -266,7 +272,8 @@ def _compute_gain(
     x: state of the centre. `output`: matrix from x to the reports. `past`: gain, offset, noise and quantizers' error of
     reports by age and node. `present`: which numbers arrived.
     """
-    identity, shape = np.eye(past.noise.shape[-1]), past.offset.shape
+    identity = np.eye(past.noise.shape[-1])
+    shape = past.offset.shape
     # A report that earlier ones determine is measured again, with slopes that are rounding errors. A noise of the size
     # of these errors keeps the gain from dividing them by themselves.
     sizes_of_terms = jnp.reshape(jnp.abs(output) @ square_root(x.columns.diagonal), shape)
@@ -287,7 +294,8 @@ def estimate_state(state: ReportsBelief, n: int) -> Fused:
     the bound on E[(u + v)(u + v)'] holds whatever the correlation of u and v.
     """
     x = take_leading(state.gaussian, n)
-    mean, covariance = jnp.asarray(x.mean), jnp.asarray(x.covariance)
+    mean = jnp.asarray(x.mean)
+    covariance = jnp.asarray(x.covariance)
     if state.quantizer_bound is None:
         return mean, covariance
     return mean, _bound_by_young(covariance, state.quantizer_bound[:n, :n])

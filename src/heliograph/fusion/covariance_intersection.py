@@ -66,7 +66,8 @@ def trace_optimal_weights(information: Float[jax.Array, "count n n"]) -> Float[j
         new_w, new_slack = _take_newton_step(_PointWithDerivatives(w, slack, gradient, hessian))
         # Certificate: weights are good enough if max_k tr(P J_k P) is at most (1 + GAP) tr P.
         is_unfinished = jnp.max(-gradient) > (1 + rounding(GAP, trace, LOOP)) * trace
-        w, slack = jnp.where(is_unfinished, new_w, w), jnp.where(is_unfinished, new_slack, slack)
+        w = jnp.where(is_unfinished, new_w, w)
+        slack = jnp.where(is_unfinished, new_slack, slack)
         return _InteriorPointState(weights=w, slack=slack, goes_on=is_unfinished, iteration=progress.iteration + 1)
 
     def goes_on(progress: _InteriorPointState) -> jax.Array:

@@ -109,7 +109,8 @@ class EscapeQuantizer(AbstractQuantizer):
         )
         for name, value in (("amplitude", self.amplitude), ("smallest amplitude", self.smallest)):
             check_amplitude(name, value, np.ones(()), self.levels)
-        self.decay, self.growth = _check_decay(decay), _check_growth(growth)
+        self.decay = _check_decay(decay)
+        self.growth = _check_growth(growth)
         self.interval = None if interval is None else check_count("interval", interval)
 
     @in_float64
@@ -167,7 +168,9 @@ class EscapeQuantizer(AbstractQuantizer):
                 them, or NOTHING was sent; the number of the message; and whether d restarts.
         """
         escapes, segment, number, restart = (jnp.asarray(symbol) for symbol in symbols)
-        restarts, is_sent, is_beyond = restart != 0, segment != NOTHING, segment <= BELOW
+        restarts = restart != 0
+        is_sent = segment != NOTHING
+        is_beyond = segment <= BELOW
         # A missed number means a wrong amplitude, until a restart.
         is_synchronised = restarts | (state.number == number)
         # Midpoint of the segment at the doubled amplitude d 2^m; a value beyond all segments counts as +-d 2^m.

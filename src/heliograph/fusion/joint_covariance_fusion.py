@@ -124,7 +124,8 @@ class AbstractJointWeights(AbstractInformedFusion):
         """
         errors = happened.errors
         # E x = E m_i + E e_i: adding the mean error makes an estimate unbiased.
-        unbiased, joint = jnp.asarray(means) + errors.bias, errors.joint
+        unbiased = jnp.asarray(means) + errors.bias
+        joint = errors.joint
         if self.with_mean:
             unbiased = jnp.concatenate([unbiased, errors.state_mean[None]])
             count, n = unbiased.shape

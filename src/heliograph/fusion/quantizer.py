@@ -184,7 +184,8 @@ class UniformQuantizer(AbstractQuantizer):
     def __init__(self, levels: int, amplitude: Float[ArrayLike, "*n"], scale: Float[ArrayLike, "*n"] = 1.0):
         """Check and hold the number of segments of [-amplitude, amplitude], and the unit (`scale`) of x."""
         self.levels = check_levels(levels)
-        self.amplitude, self.scale = check_positive("amplitude", amplitude), check_positive("scale", scale)
+        self.amplitude = check_positive("amplitude", amplitude)
+        self.scale = check_positive("scale", scale)
         check_amplitude("amplitude times scale", self.amplitude, self.scale, self.levels)
 
     def init(self, n: int) -> tuple[()]:

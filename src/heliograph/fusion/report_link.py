@@ -131,7 +131,8 @@ class ReportLink(Module):
 
     def __init__(self, channel: Channel | None = None, delay: Float[ArrayLike, "*ages"] = 0, every: int = 1):
         """Check the channel, the delay and every how many steps it sends; store the probability of each delay."""
-        self.channel, self.every = channel, check_count("every", every)
+        self.channel = channel
+        self.every = check_count("every", every)
         if channel is not None:
             instance("channel of a report link", first(channel), AbstractRandomAffine, "a random affine map")
         if rank("delay", delay) == 0:

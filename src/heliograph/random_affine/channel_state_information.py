@@ -168,7 +168,8 @@ class ToldMap(AbstractToldMap):
         """
         if isinstance(self.make, ToldGainHop):
             return super().numbers_give_law(numbers)
-        link, typical_link = self.believed(numbers), self.believed(jnp.asarray(self.typical))
+        link = self.believed(numbers)
+        typical_link = self.believed(jnp.asarray(self.typical))
         finite = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(link) if eqx.is_array(leaf)]
         pairs = zip(_list_noise_covariances(link), _list_noise_covariances(typical_link), strict=True)
         valid = [_is_covariance(matrix, typical) for matrix, typical in pairs]
@@ -213,7 +214,10 @@ class PilotedHop(AbstractHop, AbstractToldMap):
         The one reported number is named "pilot". It is exogenous: link and plant are independent. `fresh`: given its
         reading, the gain is drawn independently with each message.
         """
-        self.memory, self.matrix, self.noise, self.names = memory, matrix, noise, ("pilot",)
+        self.memory = memory
+        self.matrix = matrix
+        self.noise = noise
+        self.names = ("pilot",)
         self.exogenous, self.fresh = True, fresh
 
     @property

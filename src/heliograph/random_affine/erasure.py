@@ -47,7 +47,8 @@ class Erasure(AbstractMapWrapper):
 
         An outcome has its probability, the map given it, and which outputs arrive.
         """
-        arrival, none_arrives = plain(self.arrival), np.zeros(self.outputs, dtype=bool)
+        arrival = plain(self.arrival)
+        none_arrives = np.zeros(self.outputs, dtype=bool)
         outcomes = [
             outcome._replace(probability=arrival * outcome.probability) for outcome in self.base.list_outcomes()
         ]

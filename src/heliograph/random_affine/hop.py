@@ -103,7 +103,8 @@ class GainAndNoise(AbstractHop):
         gain_key, noise_key = jax.random.split(key)
         gain = self.law.sample(gain_key) * jnp.asarray(self.matrix)
         noise = self.noise.sample(noise_key)[:, None]
-        top, bottom = jnp.concatenate([gain, noise], axis=1), np.eye(1, self.inputs + 1, self.inputs)
+        top = jnp.concatenate([gain, noise], axis=1)
+        bottom = np.eye(1, self.inputs + 1, self.inputs)
         return jnp.concatenate([top, bottom], axis=0)
 
     @property
@@ -130,7 +131,8 @@ class GainAndNoise(AbstractHop):
         The axes are k, the monomials of (z, 1), and those of (y, 1). B_k has the terms with |b| = k of
         E[prod_i (g (A y)_i + n_i)^a_i] = sum_{b <= a} C(a, b) E[g^|b|] (A y)^b E[n^(a-b)].
         """
-        rows, columns = count_monomials(self.outputs + 1, order), count_monomials(self.inputs + 1, order)
+        rows = count_monomials(self.outputs + 1, order)
+        columns = count_monomials(self.inputs + 1, order)
         refuse_if_too_large(rows, columns, f"moments of order {order}")
         of_known_map = symmetric_power(affine_matrix(self.matrix), order)  # rows (A y)^b, made homogeneous with 1
         row, column, remainder, binomials = plan_binomial_sums(self.outputs, order)
@@ -153,7 +155,8 @@ class GainAndNoise(AbstractHop):
         Sym^order(H) takes the monomials of (y, 1) of this degree to those of (z, 1), and the B_k are the
         `gain_coefficients`. An extreme law is a vertex of the polytope of possible probabilities of g.
         """
-        gains, coefficients = self.law.corner_moments(order), self.gain_coefficients(order)
+        gains = self.law.corner_moments(order)
+        coefficients = self.gain_coefficients(order)
         moment_map: jax.Array | np.ndarray = library(gains, coefficients).tensordot(gains, coefficients, axes=1)
         return moment_map
 
@@ -273,7 +276,8 @@ class GainAndNoise(AbstractHop):
 def affine_matrix(matrix: Matrix) -> Matrix:
     """Return [[A, 0], [0, 1]], which maps (y, 1) to (A y, 1)."""
     outputs, inputs = matrix.shape
-    zero_column, last_row = np.zeros((outputs, 1)), np.eye(1, inputs + 1, inputs)
+    zero_column = np.zeros((outputs, 1))
+    last_row = np.eye(1, inputs + 1, inputs)
     xp = library(matrix)
     extended: Matrix = xp.concatenate([xp.concatenate([matrix, zero_column], axis=1), last_row])
     return extended

@@ -123,7 +123,8 @@ class Mixture(AbstractOneOfSeveralMaps, AbstractCombination):
 
     def in_words(self) -> str:
         """Return the maps in words with their shares; a choice between a map and noise alone is an unnoticed loss."""
-        maps_in_words, shares = [affine.in_words() or DIRECT for affine in self.maps], self.choice.probabilities
+        maps_in_words = [affine.in_words() or DIRECT for affine in self.maps]
+        shares = self.choice.probabilities
         if len(maps_in_words) == 2 and maps_in_words[1] == NOTHING_SENT:
             return f"{maps_in_words[0]}, {write_percentage(shares[1])} lost unnoticed"
         choices = (f"{words} ({write_percentage(p)})" for words, p in zip(maps_in_words, shares, strict=True))

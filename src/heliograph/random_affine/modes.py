@@ -54,7 +54,8 @@ class Modes(AbstractOneOfSeveralMaps, AbstractModal):
         """Hold the Markov chain and one map for each of its modes, all of one shape and without memory of their own."""
         if not isinstance(chain, MarkovChain):
             raise fail("chain", "a MarkovChain", show_value(chain))
-        self.memory, self.maps = chain, check_maps("maps of the modes", maps)
+        self.memory = chain
+        self.maps = check_maps("maps of the modes", maps)
         if len(self.maps) != chain.modes:
             raise fail("maps of the modes", f"{chain.modes}, one for each mode", len(self.maps))
         self.check_shapes("maps of the modes")

@@ -91,7 +91,8 @@ class RelayedLinks(AbstractDelayLine):
 
         A stage that delays takes past outputs of the stage before it, stored for stage.past steps.
         """
-        size, line_map = signal_size(self.stages[0]), place_on_delay_line(self.stages[0])
+        size = signal_size(self.stages[0])
+        line_map = place_on_delay_line(self.stages[0])
         for stage in self.stages[1:]:
             line_map = Series([RelayStorage(line_map, size, stage.past), place_on_delay_line(stage)])
         return line_map

@@ -90,5 +90,6 @@ class FreshReading(AbstractFreshDraw):
     def begin(self, key: jax.Array) -> jax.Array:
         """Draw (g, a) (2,), a gain g and its reading a = g + e, where the error e has the variance `variance`."""
         gain_key, error_key = jax.random.split(key)
-        gain, error = self.law.sample(gain_key), jax.random.normal(error_key, dtype=float)
+        gain = self.law.sample(gain_key)
+        error = jax.random.normal(error_key, dtype=float)
         return jnp.stack([gain, gain + jnp.sqrt(self.variance) * error])

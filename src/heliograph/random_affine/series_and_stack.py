@@ -211,7 +211,8 @@ class Series(AbstractCombination):
         Each map is visited with the second moment of the signal that reaches it, or None if it is not known.
         A hop is a transmitter with its link. `position` has the name and number of the next one, and the signal there.
         """
-        visited, signal = list[AbstractRandomAffine](), position.signal
+        visited = list[AbstractRandomAffine]()
+        signal = position.signal
         for i, affine in enumerate(self.maps):
             changed, position = affine.visit_hops(visit, position._replace(signal=signal))
             visited.append(changed)

@@ -59,7 +59,8 @@ class Superposed(AbstractCombination):
         self, maps: Sequence[AbstractRandomAffine], noise: AbstractNoise, places: Sequence[Places], inputs: int
     ):
         """Hold the maps, the law of the noise n, and for each map the indices in y of its inputs (`places`)."""
-        self.maps, self.taken = check_maps("sum", maps), check_count("inputs of a sum", inputs)
+        self.maps = check_maps("sum", maps)
+        self.taken = check_count("inputs of a sum", inputs)
         self.noise = instance("noise of a sum", noise, AbstractNoise, "a law of a noise vector")
         self.places = tuple(
             tuple(check_count("place in the input of a sum", i, 0) for i in items("places of a map", chosen, "places"))

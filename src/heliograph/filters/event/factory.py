@@ -155,7 +155,8 @@ def _gain_and_noise_covariance(channel: ChannelByPattern) -> np.ndarray:
     A known gain has covariance 0, but E[G G'] - M M' with M = E G is computed as some eps of |M M'|. `squared_gain`
     holds |M M'|, with a last row and column of zeros for n.
     """
-    gain, covariance = np.asarray(channel.mean)[..., :-1], np.asarray(channel.covariance)
+    gain = np.asarray(channel.mean)[..., :-1]
+    covariance = np.asarray(channel.covariance)
     size = np.abs(gain)
     squared_gain = size[..., :, None, :, None] * size[..., None, :, None, :]
     leading_axes = squared_gain.ndim - 2
@@ -178,7 +179,8 @@ def _arrival_determines_y(channel: ChannelByPattern) -> bool:
     # The pairs (mode, pattern of arrivals) that can occur and in which something arrives.
     possible = [(j, a) for j, a in np.argwhere(np.asarray(channel.chance) > 0) if channel.present[a].any()]
     for j, a in possible:
-        gain, arrives = np.asarray(channel.mean)[j, a, :, :-1], np.asarray(channel.present)[a]
+        gain = np.asarray(channel.mean)[j, a, :, :-1]
+        arrives = np.asarray(channel.present)[a]
         # Rows are scaled to 1, so that the rank does not depend on units.
         row_size = np.abs(gain).max(axis=1, keepdims=True)
         scaled_gain = gain / np.where(row_size > 0, row_size, 1.0)
@@ -248,7 +250,8 @@ def _has_independent_losses(channel: ChannelByPattern) -> bool:
     The probability of each pattern of arrivals is then the product of the probabilities of its components.
     `channel.mean` is E[(G, n)] of z = G y + n.
     """
-    m, chance = channel.mean.shape[-2], np.asarray(channel.chance)
+    m = channel.mean.shape[-2]
+    chance = np.asarray(channel.chance)
     if len(chance) > 1:
         return False
     arrival_probability = chance[0] @ np.asarray(channel.present)

@@ -117,7 +117,8 @@ def truncate_to_ball(mixture: GaussianSum, directions: jax.Array, radius: jax.Ar
         variance, eigenvectors = eigh(WeightedColumns(slopes, x.variances).covariance)
         # Components without variance, up to rounding, stay where they are.
         least = CERTAIN**0.5 * (radius**2 + jnp.sum(centre**2))
-        slopes, centre = eigenvectors.T @ slopes, eigenvectors.T @ centre
+        slopes = eigenvectors.T @ slopes
+        centre = eigenvectors.T @ centre
         variance_or_least = jnp.maximum(variance, least)
         # Log probability of the region, E e and Cov e in it. `varies`: components to be changed, of a possible region.
         moments = ball_moments(centre, variance_or_least, radius, inside)
@@ -142,7 +143,8 @@ def _truncate_component(centre: jax.Array, variance: jax.Array, radius: jax.Arra
     deviation = jnp.sqrt(variance)
     edge = jnp.array([-1.0, 1.0]) * radius
     if inside:
-        low, high = (edge[:1] - centre) / deviation, (edge[1:] - centre) / deviation
+        low = (edge[:1] - centre) / deviation
+        high = (edge[1:] - centre) / deviation
         sign, moments = jnp.ones(1), truncated_normal(low, high)
     else:
         sign = jnp.array([-1.0, 1.0])

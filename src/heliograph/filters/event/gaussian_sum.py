@@ -104,7 +104,8 @@ def truncate_outside(mixture: GaussianSum, direction: jax.Array, edge: jax.Array
     slopes, mean = _project_on_direction(mixture, direction)
     # d'x <= -edge is (-d)'x >= edge, so mean and slopes change sign in the second half.
     edges = jnp.full(2 * len(mean), edge)
-    mean, slopes = jnp.concatenate([mean, -mean]), jnp.concatenate([slopes, -slopes])
+    mean = jnp.concatenate([mean, -mean])
+    slopes = jnp.concatenate([slopes, -slopes])
     return _truncate(concatenate_sums([mixture, mixture]), mean, slopes, [edges])
 
 

@@ -191,7 +191,8 @@ def _transform_by_link(x: Gaussian, link: LinkMoments, m: int) -> tuple[jax.Arra
     noise is (n - E n) + (G - E G) y: a random gain acts like noise with a covariance that depends on E[y y'].
     """
     mean_y, slopes_y = x.mean[-m:], x.root[-m:]
-    gain, offset = link.mean[:, :-1], link.mean[:, -1]  # E G, E n
+    gain = link.mean[:, :-1]  # E G
+    offset = link.mean[:, -1]  # E n
     second_moment = WeightedColumns(slopes_y, x.variances).covariance + outer(mean_y, mean_y)  # E[y y']
     noise = join_columns(link.noise, factor_gain_noise(link.gain_covariance, second_moment, mean_y))
     return gain @ mean_y + offset, gain @ slopes_y, noise

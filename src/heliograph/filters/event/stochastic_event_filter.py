@@ -164,7 +164,8 @@ class StochasticEventFilter(AbstractSizedFilter):
             log_silent: log P(silent) before the value.
         """
         # If a component is missing, the innovation is returned unchanged; 0 and I only stand in for NaN here.
-        value, covariance = jnp.asarray(innovation.value), jnp.asarray(innovation.covariance)
+        value = jnp.asarray(innovation.value)
+        covariance = jnp.asarray(innovation.covariance)
         is_complete = ~jnp.any(jnp.isnan(value))
         shift, change = self._find_moment_changes_given_sent(link, signal, reference, log_silent)
         complete = jnp.where(is_complete, value, 0.0), jnp.where(is_complete, covariance, jnp.eye(len(value)))

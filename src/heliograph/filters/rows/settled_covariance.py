@@ -65,7 +65,8 @@ class SettledState(NamedTuple):
         `self.varies` says of each leaf whether it depends on data. All others are those of `self.outputs`, the output
         of a settled row.
         """
-        next_varying, leaves = iter(varying), jax.tree.leaves(self.outputs)
+        next_varying = iter(varying)
+        leaves = jax.tree.leaves(self.outputs)
         joined = [next(next_varying) if varies else leaf for leaf, varies in zip(leaves, self.varies, strict=True)]
         return jax.tree.unflatten(jax.tree.structure(self.outputs), joined)
 

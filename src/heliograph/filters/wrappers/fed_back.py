@@ -191,7 +191,8 @@ def fed_back_filter(
     Source: Schalkwijk and Kailath, A coding scheme for additive noise channels with feedback (1966), for a state that
         moves; Elia, Remote stabilization over fading channels (2005).
     """
-    chosen, rule = Cubature() if transform is None else transform, Polytope() if update is None else update
+    chosen = Cubature() if transform is None else transform
+    rule = Polytope() if update is None else update
     base = make_base_gaussian_filter("filter that is fed back", plant, sensor, channel, chosen, rule)
     refuse_angles("filter that is fed back", plant, sensor)
     # Exact: linear, the channel's moments known, no memory of the channel that a filter could use, the standard update.

@@ -146,7 +146,8 @@ class KnownDelayFilter(AbstractWrapper):
     def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
         """Correct by the channel of the received delay, the last number of z; without a delay z is not used."""
         z, delay = jnp.asarray(z)[:-1], jnp.asarray(z)[-1]
-        is_known, longest = ~jnp.isnan(delay), len(self.channels.offset) - 1
+        is_known = ~jnp.isnan(delay)
+        longest = len(self.channels.offset) - 1
         d = jnp.clip(jnp.where(is_known, delay, 0.0).astype(int), 0, longest)
         channel = jax.tree.map(lambda leaf: jnp.asarray(leaf)[d] if eqx.is_array(leaf) else leaf, self.channels)
         base = eqx.tree_at(lambda filter: filter.channel, self.base, channel)
@@ -166,7 +167,8 @@ def build_known_delay_filter(plant: AnyPlant, sensor: AnySensor, channel: Channe
     check_forgets("link with time stamps", channel.link)
     enlarged_plant, line_sensor, _ = with_past(plant, sensor, channel)  # a sensor that outputs all past signals
     links = [channel.given(d) for d in range(channel.past + 1)]  # one for each delay
-    base, start = make(enlarged_plant, line_sensor, links[0]), first(plant)
+    base = make(enlarged_plant, line_sensor, links[0])
+    start = first(plant)
     return KnownDelayFilter(
         base=base,
         channels=stack([second_order(link) for link in links]),

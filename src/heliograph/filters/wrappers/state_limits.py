@@ -205,7 +205,8 @@ class LimitedFilter(AbstractSizedFilter):
         weights, and each one outside is mirrored at the limit that it exceeds: a value x > high becomes 2 high - x.
         """
         position = jnp.asarray(state.position)
-        inside, mirrored = jnp.ones(len(state.log_weight), bool), position
+        inside = jnp.ones(len(state.log_weight), bool)
+        mirrored = position
         for index, low, high in self.limits:
             value = position[:, index]
             inside = inside & (low <= value) & (value <= high)

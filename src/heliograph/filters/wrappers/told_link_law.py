@@ -132,7 +132,8 @@ class ToldFilter(AbstractWrapper):
 
         Reported numbers are not measured. They have the innovation NaN, like missing values, so that no test uses them.
         """
-        received, rows = len(self.values) + len(self.numbers), np.array(self.values)
+        received = len(self.values) + len(self.numbers)
+        rows = np.array(self.values)
         value = jnp.full(received, jnp.nan).at[rows].set(innovation.value)
         covariance = jnp.full((received, received), jnp.nan)
         covariance = covariance.at[rows[:, None], rows].set(innovation.covariance)

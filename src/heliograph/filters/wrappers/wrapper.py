@@ -84,5 +84,6 @@ class AbstractWrapper(AbstractSizedFilter):
     def _restrict_to_first_states(self, whole: Estimate) -> Estimate:
         """Return mean and covariance of the first states, under this filter's own claim."""
         n = len(self.states)
-        mean, covariance = whole.mean[..., :n], whole.covariance[..., :n, :n]
+        mean = whole.mean[..., :n]
+        covariance = whole.covariance[..., :n, :n]
         return replace(whole, mean=mean, covariance=covariance, claim=self.claim, attitude=self.attitude)

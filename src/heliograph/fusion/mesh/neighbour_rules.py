@@ -207,7 +207,8 @@ class FrozenWeights(_NeighbourRule):
         covariances of each node and its neighbours, nodes along the last axis). So all steps of a node are computed
         at once, and its block is read once.
         """
-        blocks_by_row, arrived_by_row = np.moveaxis(np.asarray(self.blocks), -1, 0), np.swapaxes(arrived, 0, 1)
+        blocks_by_row = np.moveaxis(np.asarray(self.blocks), -1, 0)
+        arrived_by_row = np.swapaxes(arrived, 0, 1)
         with jax.enable_x64(True):
             # The native code runs once for each row, as it does elsewhere for each run; the rule is the same in all.
             choice = choose_code(

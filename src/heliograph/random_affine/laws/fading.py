@@ -78,7 +78,8 @@ class Rician(AbstractLaw):
         It is log(g) - (g - sight)^2 / (2 scale^2) + log(e^-x I_0(x)) with x = g sight / scale^2. `sight` is the gain of
         the direct path.
         """
-        sight, scale = jnp.asarray(self.sight), jnp.asarray(self.scale)
+        sight = jnp.asarray(self.sight)
+        scale = jnp.asarray(self.scale)
         bessel = jax.scipy.special.i0e(g * sight / scale**2)
         return jnp.log(g) - jnp.square((g - sight) / scale) / 2 + jnp.log(bessel)
 

@@ -106,7 +106,8 @@ def stack_branches(parts: Sequence[GaussianBranches]) -> GaussianBranches:
 
     A component is a mixture of Gaussian branches. Branches that are added have the probability 0.
     """
-    xp, largest_count = library(parts), max(law.mean.shape[1] for law in parts)
+    xp = library(parts)
+    largest_count = max(law.mean.shape[1] for law in parts)
     padding_values = (-np.inf, 0.0, 1.0)  # log of the probability 0, mean 0 and variance 1
 
     def padded(law: GaussianBranches) -> list[Array]:

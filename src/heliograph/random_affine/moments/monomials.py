@@ -163,7 +163,8 @@ def product_table(variables: int, first: int, second: int) -> np.ndarray:
 
     Monomial i has the degree `first`, and j has the degree `second`.
     """
-    a, b = factor_variables(variables, first), factor_variables(variables, second)
+    a = factor_variables(variables, first)
+    b = factor_variables(variables, second)
     shape = len(a), len(b)
     of_a = np.broadcast_to(a[:, None], (*shape, first))
     of_b = np.broadcast_to(b, (*shape, second))
@@ -272,7 +273,8 @@ def _place_lower_monomials(outputs: int, inputs: int, high: int, low: int) -> tu
     Row by row these are the positions of the monomials of (z, 1) of degree `low`, times 1^(high - low), among those of
     degree `high`; column by column those of (y, 1).
     """
-    rows, columns = times_one(outputs + 1, low, high), times_one(inputs + 1, low, high)
+    rows = times_one(outputs + 1, low, high)
+    columns = times_one(inputs + 1, low, high)
     return np.ix_(rows, columns)
 
 

@@ -108,7 +108,8 @@ class TabulatedNoise(AbstractNoise):
     def __init__(self, source: AbstractNoise, order: int):
         """Compute all moments of the noise `source` up to `order`, and hold them as a table."""
         self.mean, self.covariance, self.source = source.mean, source.covariance, source
-        self.table, self.order = noise_moment_vector(source, order), order
+        self.table = noise_moment_vector(source, order)
+        self.order = order
 
     def sample(self, key: jax.Array) -> jax.Array:
         """Draw a noise vector from the law `source` itself."""

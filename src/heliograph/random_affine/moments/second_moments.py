@@ -111,7 +111,8 @@ def has_random_gain(channel: AbstractRandomAffine, described: SecondOrder) -> bo
     if is_traced(described.spread):
         return not channel.has_known_gain
     # Covariances of the entries of G with those of (G, n): the last index on this axis, left out, is that of n.
-    center, radius = described.spread.center[..., :-1, :], described.spread.radius[..., :-1, :]
+    center = described.spread.center[..., :-1, :]
+    radius = described.spread.radius[..., :-1, :]
     size_of_covariances = np.abs(center) + np.abs(radius)
     return bool(np.any(size_of_covariances > 0)) and not channel.has_known_gain
 
@@ -143,7 +144,8 @@ def second_order(channel: AbstractRandomAffine) -> SecondOrder:
     """
     check_maps("channel of a filter", [channel])
     check_forgets("channel of a filter", channel)
-    bounds, uncertain = _bound_moments(channel), count_corners(channel) != 1
+    bounds = _bound_moments(channel)
+    uncertain = count_corners(channel) != 1
     if uncertain or not channel.has_known_gain:
         return describe_second_moments(*bounds, uncertain)
     # A known gain has Cov G = 0, so the noise of the channel's parts suffices, and no tensor of all outputs is needed.
@@ -265,7 +267,10 @@ def _bound_stacked_maps(channel: Stack) -> list[QuadraticMap]:
     map i in each entry. A bound has a center, and a radius for each entry.
     """
     mean = channel.moments(1).mean[:-1]  # E[(G, n)]: H without its last row (0, 1)
-    spreads, shifts, powers, reaches = list[QuadraticMap](), list[QuadraticMap](), list[QuadraticMap](), []
+    spreads = list[QuadraticMap]()
+    shifts = list[QuadraticMap]()
+    powers = list[QuadraticMap]()
+    reaches = []
     start = 0  # first output of the map
     for affine in channel.maps:
         moments, stop = second_order(affine), start + affine.outputs
@@ -295,7 +300,9 @@ def _find_reach_of_mean(affine: AbstractRandomAffine, mean: Matrix) -> Matrix:
     """Return the largest |E_v[(G, n)] - M| of each entry under any possible law v; M is the nominal `mean`."""
     low, high = affine.moment_interval(1)
     xp = library(low, high, mean)
-    to_high, to_low = high[:-1] - mean, low[:-1] - mean  # without the last row of E[H], (0, 1)
+    # `low` and `high` are of E[H], whose last row is (0, 1).
+    to_high = high[:-1] - mean
+    to_low = low[:-1] - mean
     reach: Matrix = xp.maximum(xp.abs(to_high), xp.abs(to_low))
     return reach
 
@@ -313,7 +320,8 @@ def _compute_mean_and_covariance(channel: AbstractRandomAffine) -> tuple[Matrix,
     if isinstance(channel, Stack):
         return library(means).concatenate(means), _stack_covariances(spreads)
     # In a sum the spreads of the parts and of its own noise add up.
-    mean_of_maps, size = channel.sum_in_places(dict(enumerate(means)), axes=1), channel.inputs + 1
+    mean_of_maps = channel.sum_in_places(dict(enumerate(means)), axes=1)
+    size = channel.inputs + 1
     noise = channel.noise.covariance[..., None, None] * make_power_of_constant(size)
     spread: Tensor = channel.sum_in_places(dict(enumerate(spreads)), axes=2) + noise
     return mean_of_maps + channel.noise.mean[:, None] * np.eye(size)[-1], spread
@@ -336,7 +344,8 @@ def _stack_covariances(spreads: Sequence[Tensor]) -> Tensor:
 
     `spreads` has for each map the covariances (m, m, p + 1, p + 1) of its (G, n); they are diagonal blocks.
     """
-    outputs_by_map, size = [len(spread) for spread in spreads], spreads[0].shape[-1]
+    outputs_by_map = [len(spread) for spread in spreads]
+    size = spreads[0].shape[-1]
     outputs = sum(outputs_by_map)
     # Places of the blocks' entries (i, j) in the flat (outputs, outputs).
     rows_by_map = np.split(np.arange(outputs), np.cumsum(outputs_by_map)[:-1])

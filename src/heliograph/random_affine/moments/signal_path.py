@@ -71,7 +71,8 @@ class ChannelPosition(NamedTuple):
 def carry_by_moments(signal: SignalMoment, moments: JointMoments) -> SignalMoment:
     """Return E (z, 1)(z, 1)' behind a random map, by its mean and second moments, from E (y, 1)(y, 1)' before it."""
     second, tensor = signal.second, moments.second
-    mean, xp = moments.mean[:-1] @ second[:, -1], library(tensor, second)
+    mean = moments.mean[:-1] @ second[:, -1]
+    xp = library(tensor, second)
     of_z = xp.einsum("ijab,ab->ij", tensor, second)
     second_behind = xp.block([[of_z, mean[:, None]], [mean[None], np.ones((1, 1))]])
     return signal._replace(second=second_behind)

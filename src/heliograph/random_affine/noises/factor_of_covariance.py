@@ -68,7 +68,8 @@ class WeightsOfFactor:
         """
         held = noise.__dict__  # the fields of the noise by name
         held["weights"] = weights
-        covariance, factor = held.get("covariance"), held.get("factor")
+        covariance = held.get("covariance")
+        factor = held.get("factor")
         found_factor, found_covariance = self._found.get(id(factor), (None, None))
         is_found = found_factor is not None and found_factor() is factor
         if is_found and found_covariance is not None and found_covariance() is covariance:

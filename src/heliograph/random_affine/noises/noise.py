@@ -257,7 +257,8 @@ class Independent(AbstractNoise):
             raise fail("independent noises", "at least one", "none")
         if no_noises := [noise for noise in self.parts if not isinstance(noise, AbstractNoise)]:
             raise fail("independent noises", "laws of a noise vector", show_value(no_noises[0]))
-        means, covariances = [noise.mean for noise in self.parts], [noise.covariance for noise in self.parts]
+        means = [noise.mean for noise in self.parts]
+        covariances = [noise.covariance for noise in self.parts]
         self.mean = library(means).concatenate(means)
         self.covariance = block_diagonal(covariances)
 

@@ -200,7 +200,8 @@ class RoundedNoise(AbstractNoise):
 
         They are those of the sensor's noise v, each with the largest variance of the rounding error e added.
         """
-        branches, error_variance = self.source.branches(), LARGEST[self.dither].error * self.step**2
+        branches = self.source.branches()
+        error_variance = LARGEST[self.dither].error * self.step**2
         return branches._replace(variance=branches.variance + error_variance[:, None])
 
     def without_outliers(self) -> NoiseWithoutOutliers:
