@@ -99,7 +99,10 @@ class EscapeQuantizer(AbstractQuantizer):
         smallest: Float[ArrayLike, "*n"],
         interval: int | None = None,
     ):
-        """Check the parameters; even at the smallest amplitude neighbouring levels must differ as numbers."""
+        """Check and hold the parameters of the class.
+
+        Amplitudes are refused for which neighbouring levels would not differ as numbers, or which overflow.
+        """
         self.levels = check_levels(levels)
         if levels % 2 == 0:
             raise fail("levels", "an odd number, so that zero is a level", levels)

@@ -90,7 +90,11 @@ class Fusion(Module):
             raise fail("fusion between neighbours", "a link of each edge (link=)", "an uplink")
 
     def check(self, nodes: Sequence[str], n: int) -> None:
-        """Raise ValueError unless rule and quantizers fit these nodes and estimates of n components."""
+        """Raise ValueError unless rule and quantizers fit these nodes and estimates of n components.
+
+        A quantizer that may send nothing at a step, and a report link, need a rule that uses reports: one that knows
+        what has arrived, and when it was sent.
+        """
         self.rule.check(len(nodes))
         for quantizer in self._quantizers(nodes):
             if not isinstance(first(quantizer), AbstractQuantizer):

@@ -148,7 +148,10 @@ def check_positive(name: str, value: ArrayLike) -> Parameter:
 
 
 def check_amplitude(name: str, amplitude: Parameter, scale: Parameter, levels: Float[Array, ""]) -> None:
-    """Raise ValueError unless amplitude times scale is finite, and a level's error has full precision."""
+    """Raise ValueError unless amplitude times scale is finite, and half a level of it is no denormal number.
+
+    `scale` is the unit of what is quantized. Traced parameters have no values to check.
+    """
     if is_traced(amplitude, scale):
         return
     with np.errstate(over="ignore", under="ignore"):

@@ -130,7 +130,10 @@ class ReportLink(Module):
     every: int = eqx.field(static=True)
 
     def __init__(self, channel: Channel | None = None, delay: Float[ArrayLike, "*ages"] = 0, every: int = 1):
-        """Check the channel, the delay and every how many steps it sends; store the probability of each delay."""
+        """Check and hold the channel and every how many steps a report is sent, and the delay as probabilities.
+
+        `self.delay` (ages,) has the probability of each number of steps 0, 1, ...; a fixed delay has probability 1.
+        """
         self.channel = channel
         self.every = check_count("every", every)
         if channel is not None:

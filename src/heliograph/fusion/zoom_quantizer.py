@@ -42,7 +42,7 @@ class ZoomQuantizer(AbstractQuantizer):
         decay: "Float[ArrayLike, '']",
         growth: "Float[ArrayLike, '']",
     ):
-        """Store a uniform quantizer, and how its amplitude decays at each step and grows with the sent value."""
+        """Check and hold the first uniform quantizer, and the parameters of d+ = decay d + growth x^2."""
         self.uniform = UniformQuantizer(levels, amplitude)
         self.decay = scalar("decay", decay)
         self.growth = scalar("growth", growth)

@@ -127,7 +127,11 @@ class DelayedLink(AbstractDelayLine):
     timestamped: bool = eqx.field(static=True)
 
     def __init__(self, link: AbstractRandomAffine, delay: Delay, timestamped: bool = False):
-        """Hold the link and, for each possible delay d, the selection S_d of y_{k-d} with its probability or mode."""
+        """Hold the link, and the delay as a map of its own from the line (y_k, y_{k-1}, ...) to the link's input.
+
+        For a delay of d steps that map is the selection S_d, which takes y_{k-d} from the line. For a random delay it
+        is a mixture of these with its probabilities, and for a chain one selection for each mode.
+        """
         (self.link,) = check_maps("delayed link", [link])
         if link.past:
             raise fail("delayed link", "one that is not late itself", f"one late by up to {link.past} steps")

@@ -188,7 +188,14 @@ class GainAndNoise(AbstractHop):
         return are_known
 
     def carry_angles(self, sent: Angles) -> Angles:
-        """Return the indices of the outputs that are angles: each must take one angle by a gain of 1, and no more."""
+        """Return the indices of the outputs of z = g A y + n that are angles, from those of y (`sent`).
+
+        An output that takes an angle must take a single one by the gain 1, and no other angle; whole multiples or sums
+        of angles are refused.
+
+        Raises:
+            ValueError: an angle with a random, unknown or other gain.
+        """
         if not sent:
             return ()
         if is_traced(self.matrix):

@@ -297,7 +297,11 @@ class Autoregression(AbstractMemory):
 
 
 def find_stationary_law(transition: Rows) -> Law:
-    """Return the stationary law p = p Pi of a chain; raise ValueError if it has several."""
+    """Return the stationary law p of a chain with the transition matrix Pi: p = p Pi and sum p = 1.
+
+    Raises:
+        ValueError: several stationary laws, as the rank of Pi - I shows (not checked if Pi is traced).
+    """
     m = len(transition)
     xp = library(transition)
     if not is_traced(transition) and np.linalg.matrix_rank(transition - np.eye(m), tol=PROBABILITY_TOLERANCE) < m - 1:

@@ -40,7 +40,10 @@ class Mixture(AbstractOneOfSeveralMaps, AbstractCombination):
         weights: "Float[ArrayLike, ' maps']",
         radius: "Float[ArrayLike, '*maps']" = 0.0,
     ):
-        """Hold the maps and their probabilities `weights`, each uncertain by up to `radius`."""
+        """Hold the maps and their probabilities `weights`, each uncertain by up to `radius`.
+
+        `choice` is the law of the number of the map that is drawn.
+        """
         self.maps = check_maps("mixture", maps)
         self.choice = Discrete(np.arange(len(self.maps)), weights, radius)
         self.check_shapes("mixture")
@@ -144,7 +147,10 @@ class Mixture(AbstractOneOfSeveralMaps, AbstractCombination):
         return self.rebuilt(*visited), position
 
     def mean_gain(self) -> AbstractRandomAffine:
-        """Return the map z = E[G] y + n, where n is Gaussian with the mean and covariance of the mixture's noise."""
+        """Return the map z = E[G] y + n, for a filter that takes the mean gain as the true one.
+
+        The noise n is Gaussian with the mean and covariance of the mixture's noise, which is z at y = 0.
+        """
         moments = self.moments(2)
         mean = moments.mean
         # Rows of the monomials z_i z_j in E[Sym^2(H)], at [i, j]; the last index, left out, is that of the constant 1.

@@ -126,7 +126,11 @@ class Superposed(AbstractCombination):
         return total.transpose(*range(1, total.ndim), 0).reshape(*values.shape[:-1], *(size,) * axes)
 
     def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
-        """Draw each map and the noise; return the next state, and H = [[G, n], [0, 1]] of the sum on all of y."""
+        """Draw each map and the noise; return the next state, and H = [[G, n], [0, 1]] of the sum on all of y.
+
+        G has the gain of each map in the columns of the components of y that it takes; n adds up the maps' noises and
+        the sum's own.
+        """
         keys = jax.random.split(key, len(self.maps) + 1)
         map_keys, noise_key = keys[:-1], keys[-1]
         state, matrices = self._draw_each(state, map_keys)

@@ -191,7 +191,11 @@ def _arrival_determines_y(channel: ChannelByPattern) -> bool:
 
 
 def _has_same_law_in_every_mode(channel: ChannelByPattern) -> bool:
-    """Return whether what arrives has the same mean and covariance in every mode in which it can arrive."""
+    """Return whether what arrives has the same mean and covariance in every mode in which it can arrive.
+
+    This must hold for each pattern of arrivals (which components come). Then a value needs one update, not one for each
+    mode of the link.
+    """
     possible = np.asarray(channel.chance) > 0  # (mode, pattern of arrivals)
     for a, modes in enumerate(possible.T):
         if not channel.present[a].any() or not modes.any():
@@ -225,7 +229,19 @@ def _delivers_y_unchanged(channel: ChannelByPattern) -> bool:
 def _check_threshold_rule(
     rule: AbstractTrigger, lost: int | None, outputs: int, received: int, steps: list[ChannelByPattern]
 ) -> AbstractThreshold:
-    """Return the sending rule; raise ValueError where the Gaussian sum has no form for its region or its losses."""
+    """Return the sending rule, if the filter's sum of Gaussians has a form for its region and its losses.
+
+    Args:
+        rule: the sending rule.
+        lost: number of Gaussians for a reference that was lost; None if nothing is lost.
+        outputs: length of the signal y.
+        received: length of what arrives.
+        steps: the law of what arrives, at each step.
+
+    Raises:
+        ValueError: no threshold rule; losses of a reference that is the value sent last without a Gaussian for them; a
+            ball of too many components; components that are sent each alone, but not over links of their own.
+    """
     trigger = instance("trigger", rule, AbstractThreshold, "SendOnDelta, SendOnPredictionError or another of these")
     if lost == 0 and trigger.reference == "sent":
         raise fail("lost", "at least 1, since transmissions may be lost", lost)

@@ -157,7 +157,10 @@ def _truncate_component(centre: jax.Array, variance: jax.Array, radius: jax.Arra
 
 
 def _join_pieces(pieces: BallMoments) -> BallMoments:
-    """Return the log of the whole mass, and the moments of the mixture of pieces (piece, ...) by their masses."""
+    """Return the moments of the union of disjoint regions, `pieces` (piece, ...), from those of each.
+
+    The masses add up. Mean and covariance are those of the mixture of the pieces, weighted by their masses.
+    """
     # Masses are divided by the largest one. If all are 0, the pieces get equal shares.
     largest = jnp.max(pieces.log_mass)
     largest = jnp.where(jnp.isfinite(largest), largest, 0.0)

@@ -75,7 +75,10 @@ class SettledState(NamedTuple):
         return [leaf for leaf, varies in zip(jax.tree.leaves(output), self.varies, strict=True) if varies]
 
     def matches(self, states: PyTree) -> Bool[np.ndarray, " n"]:
-        """Return which of the states (n, ...) equal this one in all but the means."""
+        """Return which of the states (n, ...) have the covariances of this one, and all else but the means.
+
+        In such a state the covariances and gains no longer change, so that only means need be computed.
+        """
         means = means_of(states)
         no_means = [()] * len(means)  # an empty tuple has no leaves, so that means are not compared
         other_leaves, own_leaves = (jax.tree.leaves(with_means(x, no_means)) for x in (states, self.state))

@@ -144,7 +144,11 @@ class KnownDelayFilter(AbstractWrapper):
 
     @corrects
     def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
-        """Correct by the channel of the received delay, the last number of z; without a delay z is not used."""
+        """Correct with z, whose last number is the delay d of the value before it in steps.
+
+        The filter of past and present states uses the moments of the channel for this d. If d is missing (NaN), z is
+        not used, and the state stays.
+        """
         z, delay = jnp.asarray(z)[:-1], jnp.asarray(z)[-1]
         is_known = ~jnp.isnan(delay)
         longest = len(self.channels.offset) - 1
@@ -161,7 +165,11 @@ class KnownDelayFilter(AbstractWrapper):
 
 
 def build_known_delay_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: Make) -> KnownDelayFilter:
-    """Build the filter that receives each value's delay with it, with the channel's moments at every delay."""
+    """Build the filter behind a link with time stamps, which receives with each value how late it is.
+
+    The plant's state is enlarged by the past signals y_k-1, ..., y_k-D. The filter of this state is made for no delay,
+    and holds the moments of the link for each delay d = 0, ..., D, to take those of the delay that is received.
+    """
     if not isinstance(channel, DelayedLink):
         raise fail("channel with time stamps", "one that does not vary", "one in over_time")
     check_forgets("link with time stamps", channel.link)

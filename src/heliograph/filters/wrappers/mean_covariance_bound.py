@@ -97,7 +97,10 @@ def _bound_mean_covariance(filter: ToldFilter, told: ToldNumbersByMode, u: Array
     modes = len(told.initial)
 
     def bound_step(carry: Carry, row: tuple[jax.Array, jax.Array]) -> tuple[Carry, jax.Array]:
-        """Step over one row: the mean covariance in each mode, and as output that in the mean over the modes."""
+        """Bound the mean covariance V_j in each mode j after one row; the output is its mean over the modes.
+
+        `carry`: a filter's state, the bounds V_j before the row, and the modes' probabilities. `row`: number and input.
+        """
         state, before, law = carry
         k, u_k = row
 

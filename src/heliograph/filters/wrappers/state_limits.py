@@ -72,7 +72,10 @@ class LimitedFilter(AbstractSizedFilter):
 
     @corrects
     def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
-        """Correct the prediction with its mean moved into the limits; the likelihood of z is given the limits."""
+        """Correct the prediction, its mean moved into the limits, with z.
+
+        The likelihood that is returned is p(z | x within the limits) = p(z) P(within | z) / P(within).
+        """
         after, innovation = self.base.correct(self.hold(state), z, k)
         # log p(z | within) = log p(z) + log P(within | z) - log P(within); no change where either P is 0 to rounding.
         log_within_after = self._log_probability_within(after)

@@ -135,7 +135,10 @@ LogDensity = Callable[[jax.Array], jax.Array]
 
 
 def _find_density_mode(log_density: LogDensity, low: jax.Array, high: jax.Array) -> jax.Array:
-    """Return where a density with one mode in [low, high] is largest, by ZOOMS grids of GRID points, each finer."""
+    """Return where a density with one mode in [low, high] is largest.
+
+    The interval is replaced ZOOMS times by the two cells beside the largest of GRID points in it.
+    """
     steps = np.linspace(0.0, 1.0, GRID)
 
     def zoom(_: int, ends: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:

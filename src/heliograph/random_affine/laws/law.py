@@ -311,7 +311,10 @@ class GivenMoments(AbstractLaw):
     moments: Vector
 
     def __init__(self, moments: "Float[ArrayLike, ' order']"):
-        """Hold E[g], E[g^2], ...; raise ValueError unless some distribution may have these moments."""
+        """Hold E[g], E[g^2], ...; raise ValueError unless some distribution may have these moments.
+
+        A distribution has them only if its Hankel matrix, of the entries E[g^(i + j)], is positive semidefinite.
+        """
         self.moments = array("gain moments", moments, (None,))
         if is_traced(self.moments):  # numbers that are not known yet cannot be checked
             return

@@ -137,7 +137,10 @@ class _BinomialTerms(NamedTuple):
 
 @cache_arrays
 def _list_binomial_terms(outputs: int, degree: int) -> tuple[_BinomialTerms, ...]:
-    """Return the terms of (t + r)^c = sum_b C(c, b) t^b r^(c-b), |c| = degree, for each |b| = 0, 1, ..., degree."""
+    """Return the terms of (t + r)^c = sum_b C(c, b) t^b r^(c-b) for all c with |c| = degree, sorted by |b|.
+
+    Entry k of the result has the terms with |b| = k, k = 0, 1, ..., degree. t and r have `outputs` components.
+    """
     exponents = list_exponents(outputs + 1, degree)
     by_degree_of_b: list[list[tuple[int, ...]]] = [[] for _ in range(degree + 1)]
     for c, b, remainder, binomial in zip(*plan_binomial_sums(outputs, degree), strict=True):

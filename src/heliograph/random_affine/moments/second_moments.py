@@ -118,7 +118,10 @@ def has_random_gain(channel: AbstractRandomAffine, described: SecondOrder) -> bo
 
 
 def has_known_mean(described: SecondOrder) -> bool:
-    """Return whether E[G] and E[n] are equal under all possible laws, up to rounding; False for traced parameters."""
+    """Return whether E[G] and E[n] of z = G y + n are the same under all possible laws, up to rounding.
+
+    The bound `described.shift` of what other means add is then zero. False if parameters are traced by JAX.
+    """
     if is_traced((described.shift, described.mean_gain, described.offset)):
         return False
     largest_gain = np.max(np.abs(described.mean_gain), initial=0.0)
@@ -328,7 +331,11 @@ def _compute_mean_and_covariance(channel: AbstractRandomAffine) -> tuple[Matrix,
 
 
 def _noise_covariance(channel: AbstractRandomAffine) -> Float[jax.Array | np.ndarray, "m m"]:
-    """Return Cov(z | y) of a channel of known gain, that of its noise; for a stack or sum it comes from its maps."""
+    """Return Cov n of a channel z = G y + n whose gain G is known.
+
+    For a stack the covariances of its maps are diagonal blocks, and for a sum they add up, so that no tensor of all
+    outputs and inputs is needed.
+    """
     covariance: Matrix
     if isinstance(channel, Stack):
         covariance = block_diagonal([_noise_covariance(affine) for affine in channel.maps])

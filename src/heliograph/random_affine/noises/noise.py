@@ -142,7 +142,10 @@ class Gaussian(AbstractNoise):
     weights: Vector = WeightsOfFactor(factor_by_eigenvectors, FACTOR_TOLERANCE)  # type: ignore[assignment]
 
     def __init__(self, covariance: ArrayLike, mean: ArrayLike | None = None):
-        """Hold covariance and mean, and a square root of the covariance: factor diag(weights) factor'."""
+        """Hold covariance and mean, and a factor A with weights w of the covariance, A diag(w) A', to draw from.
+
+        Known numbers are factored by eigenvectors, w = 1; a covariance that JAX traces as L diag(d) L'.
+        """
         self.covariance = check.covariance("noise covariance", covariance)
         n = self.covariance.shape[-1]
         self.mean = np.zeros(n) if mean is None else array("noise mean", mean, (n,))
@@ -185,7 +188,10 @@ class Gaussian(AbstractNoise):
         return jnp.asarray(self.mean + A @ e)
 
     def moment(self, powers: Exponents) -> Number:
-        """Return E[n^a] by E[n_i g(n)] = m_i E[g] + sum_j S_ij E[dg/dn_j] (Isserlis, Stein)."""
+        """Return E[n^a] = E[n_1^a_1 n_2^a_2 ...], a = `powers`, of n ~ N(m, S).
+
+        It is found by Stein's identity E[n_i g(n)] = m_i E[g] + sum_j S_ij E[dg/dn_j], which lowers the degree.
+        """
 
         @cache
         def expectation(a: Exponents) -> Number:
@@ -357,7 +363,10 @@ NoiseLike = TypeAliasType("NoiseLike", AbstractNoise | ArrayLike)  # a law, a co
 
 
 def as_noise(name: str, value: NoiseLike, dimension: int) -> AbstractNoise:
-    """Return a noise law as it is, and for a covariance or variance the Gaussian noise of mean zero."""
+    """Return a noise law as it is, and for a covariance or variance the Gaussian noise of mean zero.
+
+    `name` says in errors what the noise is.
+    """
     if isinstance(value, eqx.Module) and not isinstance(value, AbstractNoise):
         expected = "a variance, a covariance or a law of a noise vector (Gaussian, FiniteSupport, Independent, Shaped)"
         raise fail(name, expected, type(value).__name__)

@@ -140,7 +140,11 @@ class Contaminated(AbstractNoise):
     bounded: bool = eqx.field(static=True)
 
     def __init__(self, covariance: ArrayLike, share: ArrayLike, outlier_covariance: ArrayLike, bias: ArrayLike = 0.0):
-        """Hold shares, means and covariances of the mixture: noise without outliers first, then the outliers."""
+        """Hold the Gaussian branches of the mixture: first the noise without outliers, then each kind of outlier.
+
+        shares p_j (branches,), means m_j (branches, n), covariances R_j (branches, n, n); and of the whole the mean
+        m = sum_j p_j m_j and the covariance sum_j p_j (R_j + (m_j - m) (m_j - m)').
+        """
         # Shares, covariances and biases of the kinds of outliers, one each.
         inlier = check.covariance("covariance of contaminated noise", covariance, _size_of_number(covariance))
         n = inlier.shape[-1]
@@ -297,7 +301,10 @@ def _size_of_number(value: ArrayLike) -> int | None:
 
 
 def _read_shares(share: ArrayLike) -> tuple[list[Number], bool]:
-    """Return the probabilities of the kinds of outliers, and whether a list of them was given."""
+    """Return the probabilities of the kinds of outliers, and whether a list of them was given.
+
+    A single number is one kind. The noise is without outliers with the probability that is left to 1.
+    """
     if not rank("share of outliers", share):
         return [scalar("share of outliers", share, low=0.0, high=1.0)], False
     values = array("shares of outliers", share, ("kinds",))
