@@ -338,7 +338,7 @@ def _step_with_smoother(
 
 
 def predicts(predict: Callable[P, R]) -> Callable[P, R]:
-    """Check the arguments of a filter's `predict(state, u, k)`, pass it arrays, and compile it.
+    """Decorate a filter's `predict(state, u, k)`: its arguments are checked and made arrays, and it is compiled.
 
     Args:
         predict: the method of a filter, which gets arrays of the filter's sizes.
@@ -347,7 +347,7 @@ def predicts(predict: Callable[P, R]) -> Callable[P, R]:
 
 
 def corrects(correct: Callable[P, R]) -> Callable[P, R]:
-    """Check the arguments of a filter's `correct(state, z, k)`, pass it arrays, and compile it.
+    """Decorate a filter's `correct(state, z, k)`: its arguments are checked and made arrays, and it is compiled.
 
     Args:
         correct: the method of a filter, which gets arrays of the filter's sizes.
@@ -356,7 +356,7 @@ def corrects(correct: Callable[P, R]) -> Callable[P, R]:
 
 
 def estimates(estimate: Callable[P, R]) -> Callable[P, R]:
-    """Return a filter's method that computes in double precision and refuses a state of another form.
+    """Decorate a filter's `estimate(state)`: it computes in double precision, and refuses a state of another form.
 
     Args:
         estimate: the method, a function of the filter and its state.

@@ -135,7 +135,7 @@ class Weighed(NamedTuple):
         return tuple(_summarise_output(*of_output) for of_output in zip(*fields_by_output, strict=True))
 
     def square_used(self) -> Float[np.ndarray, "time m"]:
-        """Return the squares over their variances of those that count at least half, NaN for the others."""
+        """Return e^2 / variance of each innovation e with a weight of at least 1/2 (HALF), NaN for the others."""
         value, variance, weight = (np.asarray(column) for column in self)
         return np.where(weight >= HALF, value**2 / variance, np.nan)
 

@@ -112,7 +112,7 @@ class Fusion(Module):
 
     @property
     def by_report(self) -> bool:
-        """True where the fusion centre models each report's way: the link that it takes, or the error of its quantizer.
+        """True if the fusion centre models each report: its link (gain, noise, loss, delay), or its quantizer's error.
 
         A report is the estimate that a node sends. Other rules fuse the estimates themselves as they arrive.
         """

@@ -141,11 +141,11 @@ def separate_memories(maps: Sequence[T]) -> list[T]:
 
 
 def align_memories_over_time(maps: Sequence[T]) -> list[T]:
-    """Return the maps of all steps, where each unnamed memory has the identity of its counterpart in the first step.
+    """Return the maps of all steps such that the state of each memory goes on from step to step.
 
-    Maps with memories of equal identity share one state, so that it then goes on from step to step. Memories are
-    matched in order of appearance. If the first map has no memory, or if steps have different numbers of memories, the
-    maps are returned unchanged.
+    Memories share a state if they have the same identity, a text. So each memory without a name gets the identity of
+    its counterpart in the first step, in order of appearance. If the first map has no memory, or if steps have
+    different numbers of memories, the maps are returned unchanged.
     """
     memories_by_map = [memories(affine) for affine in maps]
     if not memories_by_map[0] or len({len(memories_of_map) for memories_of_map in memories_by_map}) > 1:

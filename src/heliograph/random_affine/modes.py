@@ -256,10 +256,10 @@ class JointModes(Module):
 def joint_modes(
     channel: AbstractRandomAffine, nodes: int | None = None, order: int = 1, beside: PyTree = ()
 ) -> JointModes:
-    """Combine the memories of a channel in one chain, the first slowest, with the map given each joint mode.
+    """Combine the memories of a channel in one Markov chain, and return it with the channel's map in each joint mode.
 
-    The transition is Pi_a x Pi_b (Kronecker). f(a, b) of maps with chains of their own is f(a_i, b_j) in mode (i, j);
-    of maps that share one, f(a_i, b_i).
+    A joint mode is one state of each memory; that of the first memory varies slowest. Independent chains with the
+    transitions Pi_a and Pi_b have together the Kronecker product Pi_a x Pi_b. Maps that share a memory share its state.
 
     Args:
         channel: any map.
@@ -293,7 +293,7 @@ def joint_modes(
     for m in maps:
         check_forgets("channel of a filter", m)
     return JointModes(
-        *joint,
+        *joint,  # initial, transition, radius
         maps=maps,
         beside=tuple(condition_on_states(beside, states) for states in states_by_mode),
     )

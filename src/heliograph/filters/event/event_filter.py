@@ -318,7 +318,7 @@ class EventFilter(AbstractSizedFilter):
         for j in range(1 if self.same_law_in_modes else status.shape[1]):
             status_of_mode = status if self.same_law_in_modes else jnp.zeros_like(status).at[:, j].set(status[:, j])
             mode = jnp.argmax(chance > 0) if self.same_law_in_modes else j
-            moments = channel.mean, channel.gain_covariance, channel.noise
+            moments = channel.mean, channel.gain_covariance, channel.noise  # each array by (mode, pattern)
             links.append(
                 LinkMoments(*jax.tree.map(lambda part, at=(mode, pattern_number): jnp.asarray(part)[at], moments))
             )

@@ -90,7 +90,11 @@ def concatenate_sums(sums: Sequence[GaussianSum]) -> GaussianSum:
 
 @jax.jit
 def truncate_between(mixture: GaussianSum, direction: jax.Array, lower: jax.Array, upper: jax.Array) -> GaussianSum:
-    """Truncate each Gaussian to lower <= d'x <= upper, (K,) or (), and take the Gaussian of the same moments."""
+    """Truncate each of K Gaussians x to lower <= d'x <= upper, and replace it by the Gaussian of the same moments.
+
+    d is `direction` (N,); the ends are numbers, or (K,) with one for each Gaussian. The weights are multiplied by the
+    probabilities of the interval.
+    """
     slopes, mean = _project_on_direction(mixture, direction)
     return _truncate(mixture, mean, slopes, [jnp.broadcast_to(end, mean.shape) for end in (lower, upper)])
 
@@ -115,9 +119,10 @@ def _project_on_direction(mixture: GaussianSum, direction: jax.Array) -> tuple[j
 
 
 def _truncate(mixture: GaussianSum, mean: jax.Array, slopes: jax.Array, ends: Sequence[jax.Array]) -> GaussianSum:
-    """Truncate Gaussians to where d'x = mean + slopes xi is above the first end, and below the second if there is one.
+    """Truncate Gaussians x = m + L xi to where d'x is above the first end, and below the second if there is one.
 
-    Each weight is multiplied by the probability of that region.
+    d'x = mean + slopes xi, with `mean` (K,) and `slopes` (K, N). Each cut law is replaced by the Gaussian of the same
+    moments, and each weight is multiplied by the probability of the region.
     """
     log_mass, truncated = truncate_gaussians(mixture.gaussian, mean, slopes, ends)
     return GaussianSum(mixture.log_weight + log_mass, truncated, mixture.status)

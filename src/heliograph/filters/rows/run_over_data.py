@@ -214,9 +214,10 @@ def step_over_known_rows(
     output: Callable[[Any, PyTree, Innovation, Array], PyTree],
     start: tuple[PyTree, Array] | tuple[()] = (),
 ) -> tuple[PyTree, PyTree]:
-    """Step a filter over rows of data outside of any trace; return the last state and the outputs, stacked.
+    """Step a filter over rows of known numbers (not traced by JAX); return the last state and the outputs, stacked.
 
-    One program of native code serves any number of rows; XLA computes what it does not take.
+    The rows are stepped over by native code that is compiled once for any number of rows. If the filter has operations
+    that this code lacks, XLA scans the rows.
 
     Args:
         filter: the filter.

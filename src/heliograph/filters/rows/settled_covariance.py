@@ -162,13 +162,14 @@ def _repeat_row_over_windows(recursion: Recursion, start: PyTree, row: PyTree, n
 
 
 def find_data_dependent_leaves(recursion: Recursion, start: PyTree, row: PyTree) -> tuple[bool, ...] | None:
-    """Return for each leaf of a complete row's output whether it depends on data, or None if nothing can settle.
+    """Return for each array in the output of a complete row whether it depends on data; None if nothing can settle.
 
     Returns None if other parts of the state than its means depend on data, or without native code. The compiled code
     says for each result, in `choice.code.common`, whether it is the same for runs with different means and rows.
     """
     rows = jax.tree.map(lambda leaf: leaf[None], row)
     means = [np.asarray(mean)[None] for mean in means_of(start)]
+    # Native code of one step (None if there is none), for runs with the same state but other means, rows and numbers.
     arguments = recursion, start, means, rows, np.zeros(1, int)
     choice = choose_code(step_settled, arguments, differs_by_run=[False, False, True, True, True])
     if choice.code is None:

@@ -103,6 +103,9 @@ def propagate_joint_covariance(
 
 
 def blocks_of(joint: Float[Array, "node n node n"], senders: Int[Array, "node degree"]) -> Float[Array, "..."]:
-    """Return the joint covariance of each node and its neighbours, (node, degree, n, degree, n)."""
+    """Return the joint covariance of each node and its neighbours, (node, degree, n, degree, n).
+
+    It is the part of `joint`, that of all nodes, with the rows and columns of the nodes in a row of `senders`.
+    """
     blocks: Float[Array, "..."] = joint[senders[:, :, None], :, senders[:, None], :].swapaxes(2, 3)
     return blocks

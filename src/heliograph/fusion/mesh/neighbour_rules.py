@@ -148,10 +148,11 @@ class DiffusionWeights(_NeighbourRule):
         return placed
 
     def neighbour_gains(self, believed: NeighbourEstimates, step: NodeStep) -> NodeGains:
-        """Return the gains of a filter with all neighbours' measurements; an estimate's gain has its share, or is zero.
+        """Return the gains of one node: M_ij = (I - P S) A c_ij of neighbour j's estimate, and P of the measurements.
 
-        Gains do not depend on what arrives: P = (Pb^-1 + S)^-1 with the information S = `step.complete` of all
-        measurements. Only those that arrived correct, with the information `step.arrived`.
+        They are those of a filter that receives all its neighbours' measurements, whatever arrives: with the predicted
+        covariance Pb and the information S = `step.complete`, P = (Pb^-1 + S)^-1. An estimate that did not arrive gets
+        the gain 0. The measurements that arrived have the information `step.arrived`.
         """
         a = jnp.asarray(step.matrix)
         predicted = symmetrize(a @ believed.covariance @ a.T + step.noise)
