@@ -216,8 +216,7 @@ def step_over_known_rows(
 ) -> tuple[PyTree, PyTree]:
     """Step a filter over rows of known numbers (not traced by JAX); return the last state and the outputs, stacked.
 
-    The rows are stepped over by native code that is compiled once for any number of rows. If the filter has operations
-    that this code lacks, XLA scans the rows.
+    Native code that is compiled once serves any number of rows; XLA scans them if the filter has other operations.
 
     Args:
         filter: the filter.
