@@ -79,7 +79,7 @@ class AbstractFilter(Module):
             refuse_attribute(self, name, INSTEAD)
 
     def init(self) -> PyTree:
-        """Return the state of the filter before the first step."""
+        """Return the filter's state before the first step: what it knows of x_0 before any data, as a pytree."""
         raise unwritten(self, "init")
 
     def predict(self, state: PyTree, u: ArrayLike = (), k: Step = 0) -> PyTree:
@@ -239,7 +239,10 @@ class AbstractFilter(Module):
 
     @property
     def has_score_recursion(self) -> bool:
-        """True if the derivatives of the log-likelihood have a recursion: of a `LinearFilter`, for `score_rows`."""
+        """True if `score_rows` can compute the score, the log-likelihood's derivatives in the model's parameters.
+
+        Only a `LinearFilter` can: a recursion over the rows carries the derivatives of its mean and covariance along.
+        """
         return False
 
     def trace_log_likelihood(self, plain: Callable[..., jax.Array], z: Array, u: Array) -> jax.Array:
@@ -259,7 +262,7 @@ class AbstractFilter(Module):
         return self
 
     def for_single_precision(self) -> "AbstractFilter":
-        """Return the same filter with a mean that keeps its digits in single precision; by default itself."""
+        """Return a filter of the same estimates whose mean keeps its digits in single precision; by default itself."""
         return self
 
     def with_room_for_heartbeats_of(self, others: Sequence["AbstractFilter"]) -> "AbstractFilter":
@@ -272,7 +275,7 @@ class AbstractFilter(Module):
 
     @property
     def attitude(self) -> Angles:
-        """Indices of attitudes among its states: a correction rotates them instead of adding. Most have none."""
+        """Indices of states that are attitudes (rotation vectors): a correction rotates instead of adding."""
         return ()
 
     @property
@@ -318,7 +321,8 @@ def step_with_judgement(
     after, innovation = filter.correct(prior, z, k)
     estimate = filter.after_step(after, k)
     estimates = filter.estimate(state), filter.estimate(prior), estimate
-    spoilt, used = do_inputs_spoil(filter, filter.inputs, u, k), filter.angles_used()
+    spoilt = do_inputs_spoil(filter, filter.inputs, u, k)
+    used = filter.angles_used()
     judgement = judge_step(filter.claim, (state, prior, after), estimates, innovation, z, filter.of_atoms, used, spoilt)
     return after, estimate, judgement, innovation
 
@@ -334,7 +338,7 @@ def _step_with_smoother(
 
 
 def predicts(predict: Callable[P, R]) -> Callable[P, R]:
-    """Check the arguments of a filter's `predict(state, u, k)`, pass it arrays, and compile it.
+    """Decorate a filter's `predict(state, u, k)`: its arguments are checked and made arrays, and it is compiled.
 
     Args:
         predict: the method of a filter, which gets arrays of the filter's sizes.
@@ -343,7 +347,7 @@ def predicts(predict: Callable[P, R]) -> Callable[P, R]:
 
 
 def corrects(correct: Callable[P, R]) -> Callable[P, R]:
-    """Check the arguments of a filter's `correct(state, z, k)`, pass it arrays, and compile it.
+    """Decorate a filter's `correct(state, z, k)`: its arguments are checked and made arrays, and it is compiled.
 
     Args:
         correct: the method of a filter, which gets arrays of the filter's sizes.
@@ -352,7 +356,7 @@ def corrects(correct: Callable[P, R]) -> Callable[P, R]:
 
 
 def estimates(estimate: Callable[P, R]) -> Callable[P, R]:
-    """Return a filter's method that computes in double precision and refuses a state of another form.
+    """Decorate a filter's `estimate(state)`: it computes in double precision, and refuses a state of another form.
 
     Args:
         estimate: the method, a function of the filter and its state.
@@ -361,6 +365,7 @@ def estimates(estimate: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(estimate)
     def call(filter: AbstractFilter, state: PyTree) -> R:
+        """Check the form of the state, and call the method."""
         return call_with_state(filter, state, run)
 
     return cast(Callable[P, R], call)
@@ -376,6 +381,7 @@ def _compile_with_checks(
 
     @wraps(function)
     def call(filter: AbstractFilter, state: PyTree, data: ArrayLike = (), k: Step = 0) -> R:
+        """Check the data (z or u), the step number and the form of the state, and call the compiled method."""
         return call_checked(filter, state, run, check(filter, data), check_step_number(filter, k))
 
     return cast(Callable[P, R], call)

@@ -68,5 +68,5 @@ def _wrap_with_input_test(function: Callable[..., R]) -> Callable[..., tuple[R, 
 
 
 def _describe_structure(state: PyTree) -> PyTree:
-    """Return the structure of a state, and the shapes of its arrays."""
+    """Return the pytree structure of a state and the shapes of its arrays, by which two states are compared."""
     return jax.tree.structure(state), [np.shape(leaf) for leaf in jax.tree.leaves(state)]

@@ -15,7 +15,10 @@ Likelihood = Callable[..., jax.Array]
 
 
 def evaluate_for_derivatives(likelihood: Likelihood) -> Likelihood:
-    """Return the same likelihood, whose trace has right derivatives also where covariances are zero."""
+    """Return the same function, traced by JAX so that derivatives are right also where covariances are zero.
+
+    This takes more operations than the value alone: `write_for_derivatives` makes the functions inside write them.
+    """
 
     def evaluate(*arguments: Any) -> jax.Array:
         """Return the likelihood of these arguments, written by more operations than its value needs."""
@@ -68,6 +71,6 @@ def take_derivatives_from(plain: Likelihood, differentiated: Likelihood, argumen
 
 
 def _replace_entries(entries: list[Any], places: list[int], values: list[jax.Array]) -> list[Any]:
-    """Return a list with these values in these places."""
+    """Return the list `entries` with values[n] in place of the entry at places[n]."""
     changed = dict(zip(places, values, strict=True))
     return [changed.get(i, entry) for i, entry in enumerate(entries)]

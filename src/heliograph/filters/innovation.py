@@ -28,7 +28,8 @@ def gaussian_innovation(
         covariance: the innovation covariance (m, m).
     """
     present = ~jnp.isnan(z)
-    value, both_present = jnp.asarray(z - expected), present[:, None] & present
+    value = jnp.asarray(z - expected)
+    both_present = present[:, None] & present
     size = jnp.abs(z) + jnp.abs(expected)  # the difference is rounded relative to the size of both terms
     log_likelihood = log_density(value, jnp.asarray(covariance), size)
     return Innovation(value, jnp.where(both_present, covariance, jnp.nan), log_likelihood)
@@ -86,7 +87,8 @@ def innovation_of_mean_covariance(
     # Differences from the first value are taken, so that equal values, however large, leave no rounding.
     difference = value - value[0]
     mean_difference = weight @ difference
-    mean, deviation = value[0] + mean_difference, difference - mean_difference
+    mean = value[0] + mean_difference
+    deviation = difference - mean_difference
     covariance = within + jnp.einsum("a,ai,aj->ij", weight, deviation, deviation)
     none_arrived = jnp.all(jnp.isnan(mean))  # then the density is 1, to rounding
     return Innovation(mean, covariance, jnp.where(none_arrived, 0.0, density))
@@ -133,14 +135,14 @@ class Weighed(NamedTuple):
         return tuple(_summarise_output(*of_output) for of_output in zip(*fields_by_output, strict=True))
 
     def square_used(self) -> Float[np.ndarray, "time m"]:
-        """Return the squares over their variances of those that count at least half, NaN for the others."""
+        """Return e^2 / variance of each innovation e with a weight of at least 1/2 (HALF), NaN for the others."""
         value, variance, weight = (np.asarray(column) for column in self)
         return np.where(weight >= HALF, value**2 / variance, np.nan)
 
 
 HALF = 0.5  # weight below which a component counts as down-weighted
 NORMAL = 1.96  # quantile of a 95 % interval
-MOST = 0.5  # share of values left out that outliers do not have
+MOST = 0.5  # a share of values left out above this is no matter of outliers
 
 
 @readable

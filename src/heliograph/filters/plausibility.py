@@ -78,7 +78,7 @@ class Judgement(NamedTuple):
 
     @property
     def implausible(self) -> Array:
-        """True where the measurement must not be used."""
+        """True where the measurement must not be used: it has a reason other than `Reason.PLAUSIBLE`, 0."""
         return self.reason > 0
 
     @staticmethod
@@ -123,7 +123,7 @@ class Judgement(NamedTuple):
 
     @staticmethod
     def find_far(innovation: Innovation) -> jax.Array:
-        """Return which components e_j are beyond the bound of their own deviations, |e_j| > 1e6 sqrt(S_jj)."""
+        """Return which components of the innovation e, of covariance S, are far: |e_j| > 1e6 sqrt(S_jj)."""
         variances = jnp.diagonal(jnp.asarray(innovation.covariance))
         return jnp.abs(innovation.value) > LIMIT * jnp.sqrt(jnp.maximum(variances, 0.0))
 
@@ -379,7 +379,7 @@ def _is_sound_prediction(prior: Estimate, claim: Claim) -> jax.Array:
 
 
 def _overflows(before: PyTree, after: PyTree) -> jax.Array:
-    """Return whether some real number of a state is infinite after the step, but was not before it."""
+    """Return whether some real number of a state is infinite after the step, but not before it; NaN does not count."""
     has_overflowed = jnp.asarray(False)
     for number_before, number_after in zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True):
         if _is_real_array(number_after):
@@ -388,7 +388,7 @@ def _overflows(before: PyTree, after: PyTree) -> jax.Array:
 
 
 def _is_real_array(leaf: Array) -> bool:
-    """Return whether an array is of real numbers, not of integers, flags or keys."""
+    """Return whether an array holds real numbers: not integers, booleans or random keys."""
     return bool(jnp.issubdtype(jnp.asarray(leaf).dtype, jnp.floating))
 
 

@@ -27,9 +27,10 @@ TOLERANCE = 1e-12  # of correlations and of gains, that are zero but for roundin
 
 
 class NoiseBranches(NamedTuple):
-    """Gaussian branches of each received component's noise: log probability, mean and variance, (m, branches) each.
+    """Noise of each received component as a mixture of Gaussians ("branches"), (m, branches) each.
 
-    `least`: variance of the branch's noise without the spread of the gain, a lower bound of the innovation's variance.
+    log_share: log probability of a branch. mean, variance: its moments. least: its variance without the spread of the
+    gain, a lower bound of the innovation's variance.
     """
 
     log_share: jax.Array
@@ -38,8 +39,11 @@ class NoiseBranches(NamedTuple):
     least: jax.Array
 
     def mean_and_variance(self) -> tuple[jax.Array, jax.Array]:
-        """Return the mean and variance of the mixture of each component's branches, (m,) each."""
-        share = jnp.exp(self.log_share)
+        """Return mean and variance (m,) of each component's noise, a mixture of Gaussians with shares p_j.
+
+        The mean is sum_j p_j m_j, and the variance sum_j p_j (r_j + (m_j - mean)^2) for branches N(m_j, r_j).
+        """
+        share = jnp.exp(self.log_share)  # p_j
         mean = jnp.sum(share * self.mean, axis=1)
         second_about_mean = self.variance + (self.mean - mean[:, None]) ** 2
         return mean, jnp.sum(share * second_about_mean, axis=1)
@@ -78,12 +82,15 @@ class ReceivedNoise(Module):
         filter counts Var(g) y^2 with the signal, so the branch adds E[g] m_j and E[g^2] r_j + Var(g) m_j (m_j + 2 y),
         which may be negative: the sum with Var(g) y^2 is at least E[g^2] r_j. The last hop's noise is added to both.
         """
-        gain, power, mean = self.gain[:, None], self.power[:, None], self.mean
+        gain = self.gain[:, None]
+        power = self.power[:, None]
+        mean = self.mean
         signal = (self.output @ sensor_mean)[:, None]  # y
         least = power * self.variance + self.late_variance
         # Var(g) m_j (m_j + 2 y), with Var(g) = E[g^2] - E[g]^2.
         squared_gain, twice_signal = gain**2, 2 * signal
-        gain_variance, mean_and_signal = power - squared_gain, mean + twice_signal
+        gain_variance = power - squared_gain
+        mean_and_signal = mean + twice_signal
         by_gain_variance = gain_variance * mean * mean_and_signal
         return NoiseBranches(
             log_share=jnp.asarray(self.log_share),

@@ -27,5 +27,11 @@ class HasStates(Protocol):
 
 
 def make_sizes(claim: Claim, like: HasStates, received: int) -> FilterSizes:
-    """Return claim, and the sizes of a filter of the states and inputs of a plant, which receives so many numbers."""
+    """Return the keyword arguments that every filter class takes: its claim, names of states and inputs, length of z.
+
+    Args:
+        claim: what its covariance is said to be ("exact", "upper", "nominal", "none").
+        like: plant or filter whose names of states and inputs are taken.
+        received: length of the measurement z.
+    """
     return FilterSizes(claim=claim, states=like.states, inputs=like.inputs, received=received)

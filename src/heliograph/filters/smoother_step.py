@@ -102,7 +102,7 @@ class SmootherStep(Module):
 
     @property
     def angles(self) -> Angles:
-        """Indices of angles among the plant's states."""
+        """Indices of the plant's states that are angles."""
         return self.manifold.angles
 
     @property
@@ -200,7 +200,8 @@ class SmootherStep(Module):
         """
         mean, columns = law.mean, law.columns
         if self.projection is not None:
-            mean, columns = self.projection @ mean, columns.through(self.projection)
+            mean = self.projection @ mean
+            columns = columns.through(self.projection)
         mean = mean if self.offset is None else mean + self.offset
         if self.limits:
             from heliograph.filters.truncation import hold_mean_within_limits, truncate_to_limits
@@ -219,7 +220,7 @@ def gaussian_of(state: PyTree) -> Any:
 
 
 def with_gaussian(state: PyTree, x: Gaussian) -> PyTree:
-    """Return a filter's state that holds another Gaussian."""
+    """Return a filter's state with `x` as its Gaussian: in its field `gaussian`, or as the state itself."""
     return state._replace(gaussian=x) if hasattr(state, "gaussian") else x
 
 
@@ -259,10 +260,11 @@ def smoother_step_of(
 
 
 def make_smoother_step(filter: Any, trace: StepTrace) -> SmootherStep:
-    """Return a filter's smoother step, with the NIS of its innovation and with no stronger claim than the filter's.
+    """Return what a backward pass needs of one step of a filter, with the NIS of the step's innovation.
 
-    A filter may return the smoother step of a filter inside it, with that filter's claim. The NIS is e' S^-1 e of the
-    innovation e with covariance S, and `count` the number of components that arrived.
+    The NIS is e' S^-1 e of the innovation e with covariance S, and `count` the number of components that arrived. A
+    filter may return the smoother step of a filter inside it: what its covariance is said to be (`claim`) is then made
+    no stronger than the filter's own claim.
     """
     step: SmootherStep = filter.smoother_step(trace)
     nis, count = innovation_distance(trace.innovation)

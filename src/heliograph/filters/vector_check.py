@@ -10,7 +10,16 @@ from heliograph.numerics.types import Array, ArrayLike, Float
 
 
 def check_vector(name: str, value: ArrayLike, length: int | None) -> Float[Array, " length"]:
-    """Return real numbers along one axis as an array of floats; a scalar is accepted for a length of one."""
+    """Return real numbers along one axis as an array of floats; a scalar is accepted for a length of one.
+
+    Args:
+        name: what the numbers are, for error messages.
+        value: numbers as a user gives them; masked entries are read as NaN.
+        length: how many there must be; None for any number.
+
+    Raises:
+        ValueError: what is no such vector.
+    """
     expected = "numbers" if length is None else f"{length} number{'s' * (length != 1)}"
     try:  # is it traced? The error of converting such a value explains its whole origin, which takes ten milliseconds
         traced = isinstance(value, jax.core.Tracer)

@@ -35,7 +35,10 @@ from heliograph.numerics.types import Array, Bool, Float
 
 
 class PastReports(NamedTuple):
-    """Reports sent 0, 1, ... steps ago: mean gain, offset, mean noise Cov(z | sent), and the quantizers' error.
+    """Model of the reports that each node sent 0, 1, ... steps ago (the age), z = G (m + mu) + n.
+
+    m is the node's estimate and mu the error of its quantizer. gain: E[G]. offset: E[n]. noise: the mean of Cov(z | m).
+    error: bound of |mu|, zero without a quantizer.
 
     Shapes: gain (age, node, m, n), offset (age, node, m), noise (age, node, m, m), error (age, node, n).
     """
@@ -109,11 +112,12 @@ def make_lossless_links(nodes: int, n: int) -> ReportModel:
 
 
 def make_initial_belief(errors: ErrorMoments, delays: int, received: int, quantized: bool) -> ReportsBelief:
-    """Return the centre's state (x, e_1, ..., e_nodes, past reports) before the first report.
+    """Return the centre's belief of s = (x, e_1, ..., e_nodes, past reports) before the first report.
 
     A report is the estimate that a node sends to the centre, and may arrive some steps late. Filters start at known
-    means m_i, so that each error e_i = x_0 - m_i deviates from its mean as x_0 does: x and all e_i share one root of
-    Cov x_0. Nothing has been sent: past reports are zeros.
+    means m_i, so that each error e_i = x_0 - m_i deviates from its mean as x_0 does. With Cov x_0 = R diag(w) R' the
+    covariance of s is [R; R; ...; R; 0] diag(w) [...]': kept as this root and w. Nothing has been sent: past reports,
+    and the gains, offsets and noises of their model (`PastReports`), are zeros.
 
     Args:
         errors: mean and covariance of (x, e_1, ..., e_nodes) at the start.
@@ -123,7 +127,7 @@ def make_initial_belief(errors: ErrorMoments, delays: int, received: int, quanti
     """
     nodes, n = errors.bias.shape
     padding = (0, nodes * n * delays)  # zeros for past reports
-    # Cov x_0 = R diag(weights) R'. The rows of R serve x and every e_i alike; those of past reports are zeros.
+    # The root of Cov s: R once for x and once for every e_i, then rows of zeros for the past reports.
     start = columns_of(errors.state_covariance)
     root_of_x_and_errors = jnp.tile(jnp.asarray(start.matrix), (1 + nodes, 1))
     root = jnp.pad(root_of_x_and_errors, (padding, (0, 0)))
@@ -155,7 +159,8 @@ class ReportMap(NamedTuple):
         zeta = (x, errors e_i of the nodes). A report is x - e_i; past reports follow zeta, the latest first.
         """
         nodes, n, _ = self.transition.errors.shape
-        zeta, past_reports = columns[: (1 + nodes) * n], columns[(1 + nodes) * n :]
+        zeta = columns[: (1 + nodes) * n]
+        past_reports = columns[(1 + nodes) * n :]
         zeta_after = self.transition @ zeta
         if not len(past_reports):
             return zeta_after
@@ -175,7 +180,8 @@ def propagate_errors(state: ReportsBelief, centre_step: CentreStep, links: Repor
     """
     step, errors = centre_step
     nodes, n, _ = step.gain.shape
-    state_size, zeta_size = len(state.gaussian.mean), len(step.offset)  # the state is zeta and past reports
+    state_size = len(state.gaussian.mean)  # of zeta and past reports
+    zeta_size = len(step.offset)
     # Noise of zeta. B w is common to x and all errors. K nu reaches the errors alone: `behind_x` puts it behind x. A
     # third part covers rounding errors, in proportion to E[x x'].
     behind_x = np.eye(zeta_size, nodes * n, -n)
@@ -225,23 +231,37 @@ def correct_with_reports(
         The corrected state, and the mean and covariance of the reports before they arrived.
     """
     # C, the expected reports C s + c, and the filter's gain K, in which rows that did not arrive count nothing.
-    x, past, values = state.gaussian, state.past, jnp.ravel(reports)
+    x = state.gaussian
+    past = state.past
+    values = jnp.ravel(reports)
     output = _make_output_matrix(past, len(x.mean))
-    expected, is_present = output @ x.mean + jnp.ravel(past.offset), ~jnp.isnan(values)
-    noise, gain = _factor_each(past.noise), _compute_gain(x, output, past, is_present)
+    expected = output @ x.mean + jnp.ravel(past.offset)
+    is_present = ~jnp.isnan(values)
+    noise = _factor_each(past.noise)
+    gain = _compute_gain(x, output, past, is_present)
     # Innovation z - (C s + c), and the error after the correction without quantizers, (I - K C) e - K n.
     innovation = jnp.where(is_present, values - expected, 0.0)
     slopes = jnp.asarray(output @ x.root)
     corrected = correct_by_gain(x, slopes, noise, gain, innovation)
-    # Quantizers' part v of the error: v+ = (I - K C) v - K G mu. Outer products v v' are bounded: of the first term as
-    # a linear map does, of the second by Cauchy's inequality, and of the sum by Young's inequality.
     quantizer_bound = None
     if state.quantizer_bound is not None:
-        remaining = propagate_by_mode(jnp.eye(len(x.mean)) - gain @ output, state.quantizer_bound, 0.0)
-        added = _bound_by_cauchy(gain @ _place_on_diagonal(past.gain), jnp.ravel(past.error))
-        quantizer_bound = symmetric(_bound_by_young(remaining, added))
+        quantizer_bound = _correct_quantizer_bound(state.quantizer_bound, gain, output, past)
     report_law = PredictedReports(expected, join_columns(WeightedColumns(slopes, x.variances), noise).covariance)
     return ReportsBelief(corrected, past, quantizer_bound), report_law
+
+
+def _correct_quantizer_bound(
+    bound: Float[jax.Array, "N N"], gain: Float[jax.Array, "N M"], output: Float[jax.Array, "M N"], past: PastReports
+) -> Float[jax.Array, "N N"]:
+    """Return a matrix above v+ v+' after a correction, from `bound`, one above v v' before it.
+
+    v is the part of the centre's error that quantizers cause: v+ = (I - K C) v - K G mu, with the gain K, the `output`
+    matrix C, the links' gains G and the quantizers' errors |mu| <= `past.error`. The first term is bounded as a linear
+    map does, the second by Cauchy's inequality, and the sum by Young's.
+    """
+    remaining = propagate_by_mode(jnp.eye(len(bound)) - gain @ output, bound, 0.0)
+    added = _bound_by_cauchy(gain @ _place_on_diagonal(past.gain), jnp.ravel(past.error))
+    return symmetric(_bound_by_young(remaining, added))
 
 
 def _compute_gain(
@@ -252,7 +272,8 @@ def _compute_gain(
     x: state of the centre. `output`: matrix from x to the reports. `past`: gain, offset, noise and quantizers' error of
     reports by age and node. `present`: which numbers arrived.
     """
-    identity, shape = np.eye(past.noise.shape[-1]), past.offset.shape
+    identity = np.eye(past.noise.shape[-1])
+    shape = past.offset.shape
     # A report that earlier ones determine is measured again, with slopes that are rounding errors. A noise of the size
     # of these errors keeps the gain from dividing them by themselves.
     sizes_of_terms = jnp.reshape(jnp.abs(output) @ square_root(x.columns.diagonal), shape)
@@ -273,7 +294,8 @@ def estimate_state(state: ReportsBelief, n: int) -> Fused:
     the bound on E[(u + v)(u + v)'] holds whatever the correlation of u and v.
     """
     x = take_leading(state.gaussian, n)
-    mean, covariance = jnp.asarray(x.mean), jnp.asarray(x.covariance)
+    mean = jnp.asarray(x.mean)
+    covariance = jnp.asarray(x.covariance)
     if state.quantizer_bound is None:
         return mean, covariance
     return mean, _bound_by_young(covariance, state.quantizer_bound[:n, :n])
@@ -303,16 +325,18 @@ def _prepend_present_reports(past: PastReports, errors: ErrorMoments, links: Rep
 
 
 def _make_output_matrix(past: PastReports, length: int) -> Float[jax.Array, "M N"]:
-    """Return C of E[reports] = C s for the state s = (x, e_1, ..., e_nodes, what was sent 1, 2, ... steps before).
+    """Return C of E[reports | s] = C s + offset, the matrix of the centre's measurements (ages nodes m, length).
 
-    e_i is the error of node i's estimate x - e_i, which the node sends. A report of age a is its mean gain times what
-    was sent: x - e_i for a = 0, the entry of s for a > 0. Reports (ages, nodes, m) stand one below the other.
+    s has `length` numbers: x (n), the errors e_1, ..., e_nodes (nodes n), then what all nodes sent 1, 2, ... steps
+    before (nodes n for each age). Node i sends its estimate x - e_i. Its report of age a is G_ai times what it sent a
+    steps ago: x - e_i for a = 0, an entry of s for a > 0. Rows of C: age after age, node after node.
     """
     ages, nodes, m, n = past.gain.shape
-    size = nodes * n
-    # What was sent, as linear functions of s: x - e_i at this step, and entries of s at earlier steps.
+    size = nodes * n  # of all errors together, and of what is sent at one step
+    # What was sent, as linear functions of s. At this step [I; ...; I] x - (e_1, ..., e_nodes):
     sent_now = np.concatenate([np.tile(np.eye(n), (nodes, 1)), -np.eye(size)], axis=1)
     sent_now = np.pad(sent_now, ((0, 0), (0, length - n - size)))
+    # At earlier steps: the entries of s behind x and the errors.
     sent_before = np.eye(length - n - size, length, n + size)
     sent = np.concatenate([sent_now, sent_before]).reshape(ages, nodes, n, length)
     return jnp.einsum("aimn,ainN->aimN", past.gain, sent).reshape(ages * nodes * m, length)
@@ -333,9 +357,10 @@ def _factor_measurement_noise(gain: Float[jax.Array, "node n m"], noise: Array) 
 
 
 def _factor_each(noise: Float[jax.Array, "age node m m"]) -> WeightedColumns:
-    """Return the factors of the joint covariance of all reports' noises, which are independent of each other.
+    """Return factors L diag(d) L' of the joint covariance of the noises of all reports, which are independent.
 
-    It is block-diagonal, age after age and node after node.
+    `noise` has the covariance (m, m) of each report. Their joint one is block-diagonal, age after age and node after
+    node, and so is L.
     """
     ages, nodes, m, _ = noise.shape
     blocks = jax.vmap(eliminate)(noise.reshape(ages * nodes, m, m))

@@ -66,11 +66,12 @@ def trace_optimal_weights(information: Float[jax.Array, "count n n"]) -> Float[j
         new_w, new_slack = _take_newton_step(_PointWithDerivatives(w, slack, gradient, hessian))
         # Certificate: weights are good enough if max_k tr(P J_k P) is at most (1 + GAP) tr P.
         is_unfinished = jnp.max(-gradient) > (1 + rounding(GAP, trace, LOOP)) * trace
-        w, slack = jnp.where(is_unfinished, new_w, w), jnp.where(is_unfinished, new_slack, slack)
+        w = jnp.where(is_unfinished, new_w, w)
+        slack = jnp.where(is_unfinished, new_slack, slack)
         return _InteriorPointState(weights=w, slack=slack, goes_on=is_unfinished, iteration=progress.iteration + 1)
 
     def goes_on(progress: _InteriorPointState) -> jax.Array:
-        """Return whether another step is to be taken."""
+        """Return whether the weights are not good enough yet, and steps are left."""
         return progress.goes_on & (progress.iteration < ITERATIONS)
 
     # From equal weights, which are inside the simplex.
@@ -176,7 +177,7 @@ def intersect_inverse_covariances(
     p_information, q_information = invert_covariances(both)
 
     def fuse_covariances(w: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return V and C at the weight w."""
+        """Return V = (P^-1 + Q^-1 - C)^-1 and C = (w P + (1 - w) Q)^-1 for the weight w of P."""
         common = invert_covariances((w * p + (1 - w) * q)[None])[0]
         return invert_positive_definite(p_information + q_information - common), common
 
@@ -206,7 +207,7 @@ def intersect_inverse_covariances(
 
 
 def invert_positive_definite(a: Float[jax.Array, "n n"]) -> Float[jax.Array, "n n"]:
-    """Invert a positive definite matrix."""
+    """Return the inverse of a positive definite matrix, symmetric also in its rounding errors."""
     return symmetric(psd_solve(a, jnp.eye(len(a))))
 
 
@@ -276,9 +277,10 @@ def choose_shares_by_trace(believed: NeighbourEstimates, power: float, improveme
     equal = equal_shares(believed)
     best = _smaller_trace(intersect_shares(believed, by_trace / by_trace.sum()), equal)
     # An improvement leaves a share of zero at zero, so the first shares are all positive.
-    shares = (best[0] + equal[0]) / 2
+    (best_shares, _), (shares_if_equal, _) = best, equal
+    shares = (best_shares + shares_if_equal) / 2
     for _ in range(improvements):
-        covariance = intersect_shares(believed, shares)[1]
+        _, covariance = intersect_shares(believed, shares)
         ratio = jnp.einsum("ab,jbc,ca->j", covariance, believed.information, covariance) / jnp.trace(covariance)
         shares = shares * jnp.sqrt(jnp.maximum(ratio, 0.0))
         shares = shares / shares.sum()
@@ -306,5 +308,6 @@ def intersection_weights(believed: NeighbourEstimates, shared: Shared) -> Neighb
 
 def _smaller_trace(a: Shared, b: Shared) -> Shared:
     """Return the one of two intersections, each (shares, covariance), whose covariance has the smaller trace."""
-    is_first = jnp.trace(a[1]) <= jnp.trace(b[1])
-    return jnp.where(is_first, a[0], b[0]), jnp.where(is_first, a[1], b[1])
+    (a_shares, a_covariance), (b_shares, b_covariance) = a, b
+    is_first = jnp.trace(a_covariance) <= jnp.trace(b_covariance)
+    return jnp.where(is_first, a_shares, b_shares), jnp.where(is_first, a_covariance, b_covariance)

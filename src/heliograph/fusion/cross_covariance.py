@@ -60,7 +60,8 @@ class ErrorMap(NamedTuple):
         The plant moves x. An error moves by itself, and under a wrong model also by x (`self.of_state`).
         """
         nodes, n, _ = self.errors.shape
-        x, e = columns[:n].reshape(n, -1), columns[n:].reshape(nodes, n, -1)
+        x = columns[:n].reshape(n, -1)
+        e = columns[n:].reshape(nodes, n, -1)
         e_after = self.errors @ e + self.of_state @ x
         x_after = self.plant @ x
         return jnp.concatenate([x_after, e_after.reshape(nodes * n, -1)]).reshape(columns.shape)
@@ -90,7 +91,8 @@ class ErrorStep(NamedTuple):
         if self.received.ndim == 4:
             by_received = jnp.einsum("iam,imjl,jbl->iajb", self.gain, self.received, self.gain)
         else:
-            numbers, blocks = jnp.arange(nodes), symmetrize(propagate_by_mode(self.gain, self.received, 0.0))
+            numbers = jnp.arange(nodes)
+            blocks = symmetrize(propagate_by_mode(self.gain, self.received, 0.0))
             by_received = jnp.zeros((nodes, n, nodes, n)).at[numbers, :, numbers, :].set(blocks)
         padded = jnp.pad(by_received.reshape(nodes * n, nodes * n), ((n, 0), (n, 0)))  # it does not reach x
         return jnp.asarray(propagate_by_mode(self.noise_input, self.process, padded))
@@ -160,7 +162,9 @@ def make_error_step(filters: LinearStep, motion: Motion, observation: JointObser
     A difference of two nearly equal matrices, such as A - F, is taken for 0 if it is rounding.
     """
     # K, U and L, where M - C is the error of the filter's model of the measurement.
-    gain, u, n = jnp.asarray(filters.gain), filters.error_transition(), len(motion.offset)
+    gain = jnp.asarray(filters.gain)
+    u = filters.error_transition()
+    n = len(motion.offset)
     wrong_gain = gain @ _subtract_without_rounding(observation.gain, filters.output)
     # A - F and b - f, then U (b - f) - L b - K (o - c).
     matrices = _subtract_without_rounding(jnp.broadcast_to(motion.matrix, filters.transition.shape), filters.transition)
@@ -209,7 +213,7 @@ class ErrorSources(NamedTuple):
     independent: Float[Array, "node n n"]
 
     def covariances(self) -> Float[Array, "node n n"]:
-        """Return Cov e_i of each node, by its sources and its own part."""
+        """Return Cov e_i = R_i R_i' + Cov a_i of each node (node, n, n), with R_i = `shared`_i."""
         return self.shared @ self.shared.swapaxes(-1, -2) + self.independent
 
     def joint(self) -> Float[Array, "node n node n"]:
@@ -286,7 +290,8 @@ def propagate_factors(factors: SourceFactors, step: ErrorStep, k: jax.Array) -> 
     independent part of node i's error.
     """
     nodes, n, m = step.gain.shape
-    new_roots, independent_noise = step.noise_input @ cholesky(jnp.asarray(step.process)), jnp.zeros(())
+    new_roots = step.noise_input @ cholesky(jnp.asarray(step.process))
+    independent_noise = jnp.zeros(())
     if step.received.ndim == 4:
         # Factors of -K nu, whose rows stand below those of x.
         root = cholesky(jnp.asarray(step.received).reshape(nodes * m, nodes * m)).reshape(nodes, m, nodes * m)
@@ -309,5 +314,5 @@ def _subtract_without_rounding(a: Array, b: Array) -> jax.Array:
 
 
 def _multiply_by_node(matrix: Array, vector: Array) -> jax.Array:
-    """Return the product of matrix and vector for each node."""
+    """Return matrix_i vector_i for each node i: (node, n, m) and (node, m) -> (node, n)."""
     return jnp.einsum("iab,ib->ia", matrix, vector)

@@ -28,8 +28,9 @@ from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int
 class UplinkSymbols(NamedTuple):
     """Symbols sent over the uplink for one value, by component.
 
-    How many escapes, then the segment from 0: -1 for NaN, `ABOVE` and `BELOW` for a value beyond the range of numbers.
-    `number` counts the values that were sent; `restart` says that the first amplitude is used.
+    escapes: how many times the amplitude is doubled. segment: index, from 0, of the segment that holds the value, or
+    `NOTHING` (-1) for NaN, `ABOVE` or `BELOW` for a value beyond the range of numbers. number: how many values were
+    sent before. restart: whether the first amplitude is used.
     """
 
     escapes: Int[Array, "*n"]
@@ -38,7 +39,8 @@ class UplinkSymbols(NamedTuple):
     restart: Bool[Array, "*n"]
 
 
-NOTHING, BELOW, ABOVE = -1, -2, -3  # segments that are none
+# In place of a segment's index: no value (NaN), a value below or above the range of numbers.
+NOTHING, BELOW, ABOVE = -1, -2, -3
 LOST = -1  # the number of the next value for a receiver that has missed one
 
 
@@ -97,7 +99,10 @@ class EscapeQuantizer(AbstractQuantizer):
         smallest: Float[ArrayLike, "*n"],
         interval: int | None = None,
     ):
-        """Check the parameters; even at the smallest amplitude neighbouring levels must differ as numbers."""
+        """Check and hold the parameters of the class.
+
+        Amplitudes are refused for which neighbouring levels would not differ as numbers, or which overflow.
+        """
         self.levels = check_levels(levels)
         if levels % 2 == 0:
             raise fail("levels", "an odd number, so that zero is a level", levels)
@@ -107,7 +112,8 @@ class EscapeQuantizer(AbstractQuantizer):
         )
         for name, value in (("amplitude", self.amplitude), ("smallest amplitude", self.smallest)):
             check_amplitude(name, value, np.ones(()), self.levels)
-        self.decay, self.growth = _check_decay(decay), _check_growth(growth)
+        self.decay = _check_decay(decay)
+        self.growth = _check_growth(growth)
         self.interval = None if interval is None else check_count("interval", interval)
 
     @in_float64
@@ -125,20 +131,26 @@ class EscapeQuantizer(AbstractQuantizer):
     def encode(self, state: UplinkState, value: ArrayLike, restart: bool = False) -> UplinkSymbols:
         """Encode a value x (n,) as m escape symbols, each of which doubles the amplitude d, and the segment of x.
 
-        With m = ceil(log2(|x| / d)), from 0, x lies in [-d 2^m, d 2^m]. d is the amplitude that both ends know, or the
-        first one if `restart`. The segment is NOTHING for NaN; ABOVE or BELOW where d 2^m is no number.
+        With m = ceil(log2(|x| / d)), from 0, x lies in [-d 2^m, d 2^m], which is divided in `levels` segments. d is the
+        amplitude that both ends know, or the first one if `restart`. The segment is NOTHING for NaN; ABOVE or BELOW
+        where d 2^m is no number.
         """
         x = jnp.asarray(fill_masked(value), dtype=float)
         restarts = jnp.broadcast_to(self._is_restart(state.number) | restart, x.shape)
         amplitude = self._present_amplitude(state, restarts)
         # m by exponents, without rounding: x = x_fraction 2^x_power and d = fraction 2^power.
-        (x_fraction, x_power), (fraction, power) = jnp.frexp(x), jnp.frexp(amplitude)
+        x_fraction, x_power = jnp.frexp(x)
+        fraction, power = jnp.frexp(amplitude)
         doublings = x_power - power + (jnp.abs(x_fraction) > fraction)  # smallest m with |x| <= d 2^m, exactly
         most_doublings = np.finfo(x.dtype).maxexp - power  # the largest m for which d 2^m is a finite number
-        is_value, is_beyond = ~jnp.isnan(x), jnp.isinf(x) | (doublings > most_doublings)
-        escapes = jnp.where(x != 0, jnp.clip(jnp.where(is_beyond, most_doublings, doublings), 0), 0)
+        is_value = ~jnp.isnan(x)
+        is_beyond = jnp.isinf(x) | (doublings > most_doublings)
+        m = jnp.where(is_beyond, most_doublings, doublings)
+        escapes = jnp.where(x != 0, jnp.clip(m, 0), 0)  # none where x is within d already
+        # The segment of [-d 2^m, d 2^m], or in its place why there is none.
         segment = find_segment(x, jnp.ldexp(amplitude, escapes), self.levels)
-        segment = jnp.where(is_beyond, jnp.where(x > 0, ABOVE, BELOW), jnp.where(is_value, segment, NOTHING))
+        beyond = jnp.where(x > 0, ABOVE, BELOW)
+        segment = jnp.where(is_beyond, beyond, jnp.where(is_value, segment, NOTHING))
         return UplinkSymbols(
             escapes=jnp.where(is_value, escapes, 0).astype(int),
             segment=segment.astype(int),
@@ -159,7 +171,9 @@ class EscapeQuantizer(AbstractQuantizer):
                 them, or NOTHING was sent; the number of the message; and whether d restarts.
         """
         escapes, segment, number, restart = (jnp.asarray(symbol) for symbol in symbols)
-        restarts, is_sent, is_beyond = restart != 0, segment != NOTHING, segment <= BELOW
+        restarts = restart != 0
+        is_sent = segment != NOTHING
+        is_beyond = segment <= BELOW
         # A missed number means a wrong amplitude, until a restart.
         is_synchronised = restarts | (state.number == number)
         # Midpoint of the segment at the doubled amplitude d 2^m; a value beyond all segments counts as +-d 2^m.
@@ -184,7 +198,7 @@ class EscapeQuantizer(AbstractQuantizer):
         return next_state, decoded
 
     def _is_restart(self, number: Int[Array, "*n"]) -> Bool[Array, "*n"]:
-        """Return whether the value of this number is sent from the first amplitude again."""
+        """Return whether the value of this number, counted from 0, uses the first amplitude: every `interval`-th."""
         return number == 0 if self.interval is None else number % self.interval == 0
 
     def _present_amplitude(self, state: UplinkState, restart: Bool[Array, "*n"]) -> Float[Array, "*n"]:
@@ -197,7 +211,7 @@ class EscapeQuantizer(AbstractQuantizer):
 
 
 def _check_decay(value: ArrayLike) -> Parameter:
-    """Return the decay of the amplitude, which must lie between 0 and 1."""
+    """Return the decay as an array; raise ValueError unless it is in (0, 1) (not checked if JAX traces it)."""
     decay = check_parameter("decay", value)
     if not isinstance(decay, jax.Array) and np.any((decay <= 0) | (decay >= 1)):
         raise fail("decay", "numbers between 0 and 1", value)
@@ -205,7 +219,7 @@ def _check_decay(value: ArrayLike) -> Parameter:
 
 
 def _check_growth(value: ArrayLike) -> Parameter:
-    """Return the growth of the amplitude with the sent value, which must not be negative."""
+    """Return the growth as an array; raise ValueError if it is negative (not checked if JAX traces it)."""
     growth = check_parameter("growth", value)
     if not isinstance(growth, jax.Array) and np.any(growth < 0):
         raise fail("growth", "no negative number", value)

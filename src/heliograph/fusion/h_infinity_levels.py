@@ -27,10 +27,11 @@ def level_weights(levels: Float[ArrayLike, " N"]) -> Float[np.ndarray, "N"]:
 
 
 def fused_level(levels: Float[ArrayLike, " N"], weights: Float[ArrayLike, " N"]) -> float:
-    """Return sum_i c_i gamma_i: the level of a weighted fusion without quantization, for disturbances of equal norm.
+    """Return sum_i c_i gamma_i, an H-infinity level of the weighted fusion sum_i c_i xhat_i of unquantized estimates.
 
-    A level bounds a node's ratio of error to disturbance, by norms. The fused error is sum c_i e_i and a norm is convex
-    (Minkowski), so the fused level is never above the largest local one.
+    A level gamma_i says ||e_i|| <= gamma_i ||w_i|| for the error e_i of node i and any disturbance w_i of finite
+    energy. If all ||w_i|| are the same number ||w||, the fused error sum_i c_i e_i has at most the norm
+    sum_i c_i gamma_i ||w|| (Minkowski). So the fused level is never above the largest local one.
 
     Args:
         levels: gamma_i of the nodes (N,), positive.

@@ -30,7 +30,11 @@ Joint = Float[jax.Array, "node n node n"]
 
 
 class CentreStep(NamedTuple):
-    """What the centre knows of one step: motion, error recursion, E[nu nu'], and joint moments after it."""
+    """What the centre knows of one step, before any data.
+
+    step: linear recursion of the plant's state and the nodes' errors, with its noises. errors: their mean and joint
+    covariance after it.
+    """
 
     step: ErrorStep
     errors: ErrorMoments
@@ -48,15 +52,15 @@ class AbstractInformedFusion(AbstractFusion):
         return False
 
     def claim(self, claims: list[Claim]) -> Claim:
-        """Refuse: the local claims do not determine the joint covariance."""
+        """Raise ValueError: what local covariances claim to be does not determine the joint covariance."""
         raise self._refuse_without_joint()
 
     def combine(self, means: Means, covariances: Covariances) -> Fused:
-        """Refused: the local covariances alone are not enough."""
+        """Raise ValueError: without the joint covariance the local means and covariances are not enough."""
         raise self._refuse_without_joint()
 
     def start(self, errors: ErrorMoments) -> PyTree:
-        """Return the rule's state before the first step."""
+        """Return the rule's state before the first step, from the moments of x_0 and the errors; none by default."""
         return ()
 
     def fuse_step(self, state: PyTree, happened: CentreStep, means: Means) -> tuple[PyTree, Fused]:
@@ -85,15 +89,15 @@ class AbstractJointWeights(AbstractInformedFusion):
 
     @property
     def needs_joint(self) -> bool:
-        """Always True."""
+        """Always True: the weights minimise the fused covariance, which depends on the joint covariance."""
         return True
 
     def weights(self, joint: Float[Array, "node n node n"]) -> Float[Array, "n node n"]:
-        """Compute W from P."""
+        """Return the weights W (n, node, n) that are best for the joint covariance P = `joint` of the errors."""
         raise unwritten(self, "weights")
 
     def weights_of_arrived(self, joint: Joint, present: Bool[jax.Array, " node"]) -> Float[jax.Array, "n node n"]:
-        """Compute W from P for those estimates that are present, zero for the others."""
+        """Return the best weights of the estimates that arrived (`present`), for P = `joint`; the others have zeros."""
         raise unwritten(self, "arrived")
 
     def neighbour_weights(self, believed: NeighbourEstimates) -> NeighbourWeights:
@@ -120,7 +124,8 @@ class AbstractJointWeights(AbstractInformedFusion):
         """
         errors = happened.errors
         # E x = E m_i + E e_i: adding the mean error makes an estimate unbiased.
-        unbiased, joint = jnp.asarray(means) + errors.bias, errors.joint
+        unbiased = jnp.asarray(means) + errors.bias
+        joint = errors.joint
         if self.with_mean:
             unbiased = jnp.concatenate([unbiased, errors.state_mean[None]])
             count, n = unbiased.shape
@@ -148,11 +153,11 @@ class MatrixWeights(AbstractJointWeights):
     with_mean: bool = eqx.field(static=True, default=False)
 
     def weights(self, joint: Float[Array, "node n node n"]) -> Float[Array, "n node n"]:
-        """Return the matrix weights (n, node, n)."""
+        """Return the matrix weights W_i = weights[:, i] that minimise the fused covariance; shape (n, node, n)."""
         return matrix_weights(joint)
 
     def weights_of_arrived(self, joint: Joint, present: Bool[jax.Array, " node"]) -> Float[jax.Array, "n node n"]:
-        """Return the weights of those that are present."""
+        """Return the matrix weights of the estimates that arrived, zero for the others; a small ridge bounds them."""
         return solve_regularised_weights(joint, present)
 
 
@@ -170,21 +175,23 @@ class DiagonalWeights(AbstractJointWeights):
     with_mean: bool = eqx.field(static=True, default=False)
 
     def weights(self, joint: Float[Array, "node n node n"]) -> Float[Array, "n node n"]:
-        """Return the diagonal weights (n, node, n)."""
+        """Return the best weights that are diagonal matrices, W_i = weights[:, i]; shape (n, node, n)."""
         return diagonal_weights(joint)
 
     def weights_of_arrived(self, joint: Joint, present: Bool[jax.Array, " node"]) -> Float[jax.Array, "n node n"]:
-        """Return the weights of those that are present."""
+        """Return the diagonal weights of the estimates that arrived, zero for the others; a small ridge bounds them."""
         return solve_regularised_weights_by_component(joint, present)
 
     def neighbour_weights(self, believed: NeighbourEstimates) -> NeighbourWeights:
-        """Return the weights of the neighbours' estimates that arrived, by component where neighbours are few.
+        """Return the diagonal weights W_j of the neighbours' estimates that arrived, and the covariance W P W'.
 
-        WRITTEN is the largest number of neighbours for which the solution is written out, without matrix products.
+        P = `believed.joint` is the joint covariance of the estimates' errors. Up to WRITTEN neighbours only the
+        diagonals (neighbour, n) of the W_j are computed and multiplied, which is cheaper; for more, whole matrices.
         """
         if believed.joint is None or self.with_mean or len(believed.present) > WRITTEN:
-            return super().neighbour_weights(believed)
+            return super().neighbour_weights(believed)  # which also refuses with_mean and a missing joint covariance
         diagonals = component_weights(believed.joint, believed.present)
+        # A weight is a factor that all neighbours share, here I, times one of each neighbour, here diagonal.
         return NeighbourWeights(
             common_factor=jnp.eye(diagonals.shape[1]),
             neighbour_factors=diagonals,
@@ -208,9 +215,9 @@ class ScalarWeights(AbstractJointWeights):
     with_mean: bool = eqx.field(static=True, default=False)
 
     def weights(self, joint: Float[Array, "node n node n"]) -> Float[Array, "n node n"]:
-        """Return the scalar weights times the identity (n, node, n)."""
+        """Return the best weights w_i I = weights[:, i], one number for each node; shape (n, node, n)."""
         return scalar_weights(joint)
 
     def weights_of_arrived(self, joint: Joint, present: Bool[jax.Array, " node"]) -> Float[jax.Array, "n node n"]:
-        """Return the weights of those that are present."""
+        """Return the weights w_i I of the estimates that arrived, zero for the others; a small ridge bounds them."""
         return solve_regularised_scalar_weights(joint, present)

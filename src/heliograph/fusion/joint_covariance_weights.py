@@ -15,17 +15,17 @@ from heliograph.numerics.lapack import pseudo_solve, regular_solve
 from heliograph.numerics.linalg import WRITTEN, psd_solve, rounding, symmetric, symmetrize
 from heliograph.numerics.types import Array, Bool, Float
 
-RANK = 4096  # units of rounding of the largest eigenvalue: directions of smaller eigenvalues have no error
-RIDGE = 1e-8  # share of a variance that each estimate is taken to have as independent error besides
+RANK = 4096  # an eigenvalue below so many roundings of the largest one counts as 0
+RIDGE = 1e-8  # independent error that is added to each estimate, as a share of the mean variance
 
 
 Weights = Callable[..., Float[jax.Array, "n node n"]]
 
 
 def _with_joint_check(weights: Weights) -> Weights:
-    """Decorate weights so that they refuse an array that is no joint covariance.
+    """Decorate a function of a joint covariance Cov(e_i, e_j), so that it refuses another shape of its argument.
 
-    It is Cov(e_i, e_j) of all nodes, of shape (nodes, n, nodes, n).
+    The shape is (nodes, n, nodes, n).
     """
 
     @wraps(weights)
@@ -135,6 +135,7 @@ def _weigh_components(weigh: Weights, joint: Float[jax.Array, "node n node n"]) 
     nodes, n = joint.shape[:2]
     # Component a of all nodes has a joint covariance like that of a state with one component, (node, 1, node, 1).
     component = jnp.stack([joint[:, a, :, a] for a in range(n)])
+    # The weights of one component are (1, node, 1): [0, :, 0] leaves one number for each node.
     weights = jax.vmap(lambda block: weigh(block.reshape(nodes, 1, nodes, 1))[0, :, 0])(component)
     return jnp.einsum("ai,ab->aib", weights, jnp.eye(n))
 

@@ -90,7 +90,11 @@ class Fusion(Module):
             raise fail("fusion between neighbours", "a link of each edge (link=)", "an uplink")
 
     def check(self, nodes: Sequence[str], n: int) -> None:
-        """Raise ValueError unless rule and quantizers fit these nodes and estimates of n components."""
+        """Raise ValueError unless rule and quantizers fit these nodes and estimates of n components.
+
+        A quantizer that may send nothing at a step, and a report link, need a rule that uses reports: one that knows
+        what has arrived, and when it was sent.
+        """
         self.rule.check(len(nodes))
         for quantizer in self._quantizers(nodes):
             if not isinstance(first(quantizer), AbstractQuantizer):
@@ -108,7 +112,7 @@ class Fusion(Module):
 
     @property
     def by_report(self) -> bool:
-        """True where the fusion centre models each report's way: the link that it takes, or the error of its quantizer.
+        """True if the fusion centre models each report: its link (gain, noise, loss, delay), or its quantizer's error.
 
         A report is the estimate that a node sends. Other rules fuse the estimates themselves as they arrive.
         """
@@ -144,5 +148,5 @@ class Fusion(Module):
         return self.rule.claim(quantized_claims)
 
     def _quantizers(self, nodes: Sequence[str]) -> list[Quantizer]:
-        """List the quantizers of all nodes, one for each."""
+        """Return the quantizer of each node, in their order; an empty list if nothing is quantized."""
         return [] if self.quantizer is None else spread_over_names("quantizers", self.quantizer, nodes)

@@ -81,7 +81,7 @@ class AbstractQuantizer(Module):
         )
 
     def check(self, n: int) -> None:
-        """Raise ValueError unless the parameters fit values of n components."""
+        """Raise ValueError unless each parameter is one number or has one for each of n components."""
         for leaf in jax.tree.leaves(self):
             if np.shape(leaf) not in ((), (n,)):
                 raise fail("quantizer", f"numbers or shape ({n},) for each parameter", f"shape {np.shape(leaf)}")
@@ -103,37 +103,44 @@ def widen_by_quantization(covariance: Float[Array, "n n"], error: Float[Array, "
     return (1 + t) * covariance + (r + s) * jnp.diag(error)
 
 
-Parameter = Float[Array, "..."]  # of all components, or of each
+Parameter = Float[Array, "..."]  # one number for all components, or one for each (n,)
 
 
 def find_segment(x: Float[jax.Array, "*n"], amplitude: Parameter, levels: Float[Array, ""]) -> Float[jax.Array, "*n"]:
-    """Return the index, from 0, of the segment of [-amplitude, amplitude] that holds x."""
+    """Return the index s = 0, ..., levels - 1 of the segment of [-amplitude, amplitude] that holds x.
+
+    The interval is divided in `levels` equal segments. A value outside gets the first or the last one.
+    """
     return jnp.clip(jnp.floor((x / amplitude + 1) * levels / 2), 0, levels - 1)
 
 
 def midpoint(segment: Array, amplitude: Parameter, levels: Float[Array, ""]) -> Float[jax.Array, "*n"]:
-    """Return the midpoint of a segment; exactly zero for the middle one of an odd number.
+    """Return the midpoint (2 s + 1 - L) / L d of segment s = 0, ..., L - 1, of L = `levels` that divide [-d, d].
 
-    The quotient comes first: the product with many levels could overflow.
+    d is the `amplitude`. The middle one of an odd number of segments has exactly the midpoint 0.
     """
+    # The quotient comes first: the product with many levels could overflow.
     return jnp.asarray((2 * segment + 1 - levels) / levels * amplitude)
 
 
 def check_levels(value: int) -> Float[np.ndarray, ""]:
-    """Return the number of segments, at least two, as a float."""
+    """Return the number of segments as a float array (); raise ValueError unless it is a whole number from 2."""
     check_count("levels", value, 2)
     return np.asarray(value, dtype=np.float64)
 
 
 def check_parameter(name: str, value: ArrayLike) -> Parameter:
-    """Return a parameter as a number, or as one number per component."""
+    """Return a parameter as an array: () for one number that all components have, (n,) for one of each component."""
     is_list = isinstance(value, Sequence) or rank(name, value) > 0
     numbers: Parameter = array(name, value, (None,) if is_list else ())
     return numbers
 
 
 def check_positive(name: str, value: ArrayLike) -> Parameter:
-    """Return a parameter that must be positive."""
+    """Return a parameter as an array; raise ValueError unless it is positive.
+
+    A JAX array may be traced, as in learning, and then has no value to compare: it is taken unchecked.
+    """
     numbers = check_parameter(name, value)
     if not isinstance(numbers, jax.Array) and np.any(numbers <= 0):
         raise fail(name, "positive numbers", value)
@@ -141,7 +148,10 @@ def check_positive(name: str, value: ArrayLike) -> Parameter:
 
 
 def check_amplitude(name: str, amplitude: Parameter, scale: Parameter, levels: Float[Array, ""]) -> None:
-    """Raise ValueError unless amplitude times scale is finite, and a level's error has full precision."""
+    """Raise ValueError unless amplitude times scale is finite, and half a level of it is no denormal number.
+
+    `scale` is the unit of what is quantized. Traced parameters have no values to check.
+    """
     if is_traced(amplitude, scale):
         return
     with np.errstate(over="ignore", under="ignore"):
@@ -175,9 +185,10 @@ class UniformQuantizer(AbstractQuantizer):
     scale: Parameter
 
     def __init__(self, levels: int, amplitude: Float[ArrayLike, "*n"], scale: Float[ArrayLike, "*n"] = 1.0):
-        """Keep the number of segments, the amplitude of what is quantized, and the scale that divides it."""
+        """Check and hold the number of segments of [-amplitude, amplitude], and the unit (`scale`) of x."""
         self.levels = check_levels(levels)
-        self.amplitude, self.scale = check_positive("amplitude", amplitude), check_positive("scale", scale)
+        self.amplitude = check_positive("amplitude", amplitude)
+        self.scale = check_positive("scale", scale)
         check_amplitude("amplitude times scale", self.amplitude, self.scale, self.levels)
 
     def init(self, n: int) -> tuple[()]:
@@ -186,7 +197,7 @@ class UniformQuantizer(AbstractQuantizer):
 
     @in_float64
     def step(self, state: PyTree, value: ArrayLike) -> tuple[PyTree, Quantized]:
-        """Quantize with the fixed amplitude."""
+        """Return the unchanged state, and the value (n,) rounded to the midpoint of its segment."""
         x = jnp.asarray(fill_masked(value), dtype=float)
         return state, _quantize_uniformly(x, self.amplitude, self.levels, self.scale)
 

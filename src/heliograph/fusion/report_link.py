@@ -22,7 +22,7 @@ from heliograph.random_affine.base import AbstractRandomAffine
 
 
 class LastSent(NamedTuple):
-    """Value that was sent last, and whether there is one."""
+    """value: the estimate (n,) that was sent last. any: whether one was sent at all; the value is zero before."""
 
     value: Float[jax.Array, " n"]
     any: Bool[jax.Array, ""]
@@ -57,7 +57,7 @@ class EventSending(AbstractQuantizer):
 
     @property
     def silent(self) -> bool:
-        """True where a step may pass without a value for the receiver."""
+        """True if the receiver has no value (NaN) at steps at which nothing is sent: it does not know the rule."""
         return not self.announced
 
     @property
@@ -70,7 +70,7 @@ class EventSending(AbstractQuantizer):
 
     @in_float64
     def init(self, n: int) -> LastSent:
-        """Return the state before the first value."""
+        """Return the state before the first value of n components is sent."""
         return LastSent(jnp.zeros(n), jnp.asarray(False))
 
     @in_float64
@@ -130,8 +130,12 @@ class ReportLink(Module):
     every: int = eqx.field(static=True)
 
     def __init__(self, channel: Channel | None = None, delay: Float[ArrayLike, "*ages"] = 0, every: int = 1):
-        """Check the channel, the delay and every how many steps it sends; store the probability of each delay."""
-        self.channel, self.every = channel, check_count("every", every)
+        """Check and hold the channel and every how many steps a report is sent, and the delay as probabilities.
+
+        `self.delay` (ages,) has the probability of each number of steps 0, 1, ...; a fixed delay has probability 1.
+        """
+        self.channel = channel
+        self.every = check_count("every", every)
         if channel is not None:
             instance("channel of a report link", first(channel), AbstractRandomAffine, "a random affine map")
         if rank("delay", delay) == 0:
@@ -141,8 +145,11 @@ class ReportLink(Module):
             self.delay = probabilities("delay of a report link", delay)
 
     def check(self, n: int) -> None:
-        """Raise ValueError unless it takes reports of n components and has no memory."""
-        if self.channel is None:
+        """Raise ValueError unless the channel takes reports of n components and its draws are independent over time.
+
+        A channel that varies over time is checked at its first step: it has the same form at all steps.
+        """
+        if self.channel is None:  # lossless
             return
         channel = first(self.channel)
         if channel.inputs != n:
@@ -155,7 +162,7 @@ class ReportLink(Module):
         return bool(np.max(self.delay) == 1) and (self.channel is None or are_same(self.channel, perfect(n)))
 
     def received(self, n: int) -> int:
-        """Return the number of received components of a report of n."""
+        """Return how many numbers the centre receives of a report of n numbers."""
         return n if self.channel is None else int(first(self.channel).outputs)
 
 
@@ -179,7 +186,9 @@ def check_reports(links: Sequence[ReportLink], quantizers: Sequence[Quantizer], 
 
 
 class ReportModel(NamedTuple):
-    """Reports of one step as the centre models them, z_i = G_i m_i + n_i, quantizers' errors on m_i within error_i.
+    """Model of the reports z_i = G_i (m_i + mu_i) + n_i of one step: m_i the estimate of node i, |mu_i| <= error_i.
+
+    mu_i is the error of the node's quantizer.
 
     Shapes: gain E[G] (node, m, n), offset E[n] (node, m), covariance (node, m, m, n + 1, n + 1), which takes second
     moments of (m_i, 1) to Cov(z_i | m_i); error (node, n).

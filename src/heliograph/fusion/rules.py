@@ -37,8 +37,8 @@ Means = Float[jax.Array, "count n"]
 Covariances = Float[jax.Array, "count n n"]
 Fused = tuple[Float[jax.Array, "n"], Float[jax.Array, "n n"]]
 
-POWER = 4.0  # of the traces, in shares between neighbours
-IMPROVEMENTS = 8  # of these shares: the trace is then mostly within 1 % of its minimum
+POWER = 4.0  # shares between neighbours start in proportion to (tr P_j)^-POWER
+IMPROVEMENTS = 8  # steps that improve these shares: the trace is then mostly within 1 % of its minimum
 
 
 @readable
@@ -54,10 +54,10 @@ class AbstractFusion(Module):
         return False
 
     def check(self, count: int) -> None:
-        """Raise ValueError if the rule cannot fuse this number of estimates."""
+        """Raise ValueError if the rule cannot fuse this number of estimates; by default it can fuse any number."""
 
     def claim(self, claims: list[Claim]) -> Claim:
-        """Return the claim of the fused covariance, from the claims of the inputs."""
+        """Return what the fused covariance is said to be ("exact", "upper", "nominal"), from the inputs' claims."""
         raise unwritten(self, "claim")
 
     def combine(self, means: Means, covariances: Covariances) -> Fused:
@@ -78,7 +78,10 @@ class AbstractFusion(Module):
         return False
 
     def placed(self, graph: Graph) -> "AbstractFusion":
-        """Return the rule with what differs between the rows of a graph along the last axis of every array."""
+        """Return the rule for the nodes of a graph: with arrays whose last axis is the node, where nodes differ.
+
+        By default a rule is the same for all nodes.
+        """
         return self
 
     def neighbour_weights(self, believed: NeighbourEstimates) -> NeighbourWeights:
@@ -91,7 +94,11 @@ class AbstractFusion(Module):
                    type(self).__name__)  # fmt: skip
 
     def neighbour_gains(self, believed: NeighbourEstimates, step: NodeStep) -> NodeGains:
-        """Return the gains of one node's step: fuse what was believed, predict once, correct with what was measured."""
+        """Return the gains of one node's step: fuse the neighbours' estimates, predict once, correct with measurements.
+
+        `believed`: covariances of the estimates, and which arrived. `step`: model of the plant and information of the
+        measurements that arrived.
+        """
         return gains_of(self.neighbour_weights(believed), step)
 
 
@@ -133,7 +140,7 @@ def fuse(rule: AbstractFusion, estimates: list[Estimate], angles: "Sequence[int]
 def _combine_all(
     rule: AbstractFusion, means: Float[Array, "*batch count n"], covariances: Float[Array, "*batch count n n"]
 ) -> tuple[Float[Array, "*batch n"], Float[Array, "*batch n n"]]:
-    """Combine by the rule, vectorised over all leading axes."""
+    """Return rule.combine(means, covariances) for each entry of the leading axes (`batch`, such as run and time)."""
     combine = rule.combine
     for _ in range(means.ndim - 2):
         combine = jax.vmap(combine)
@@ -144,7 +151,7 @@ class AbstractIntersection(AbstractFusion):
     """Covariance intersection, P = (sum_i w_i P_i^-1)^-1 and x = P sum_i w_i P_i^-1 x_i, with any weights w."""
 
     def claim(self, claims: list[Claim]) -> Claim:
-        """Lower the weakest claim to "upper" at most."""
+        """Return the weakest of the claims and "upper": the intersection is a bound, whatever the correlations."""
         return _combine_claims(claims, "upper")
 
     def weights_of(self, covariances: Covariances, information: Covariances) -> Float[jax.Array, " count"]:
@@ -169,11 +176,14 @@ class CovarianceIntersection(AbstractIntersection):
     """
 
     def weights_of(self, covariances: Covariances, information: Covariances) -> Float[jax.Array, " count"]:
-        """Return the weights of least trace."""
+        """Return the weights w that minimise tr (sum_i w_i P_i^-1)^-1."""
         return trace_optimal_weights(information)
 
     def neighbour_weights(self, believed: NeighbourEstimates) -> NeighbourWeights:
-        """Intersect with shares that are nearly those of least trace: a few improvements of `TraceIntersection`."""
+        """Return the weights of covariance intersection with shares that nearly minimise the trace.
+
+        An exact search at every node would cost too much: IMPROVEMENTS steps of the search of `TraceIntersection` do.
+        """
         return intersection_weights(believed, choose_shares_by_trace(believed, POWER, IMPROVEMENTS))
 
 
@@ -184,11 +194,11 @@ class EqualIntersection(AbstractIntersection):
     """
 
     def weights_of(self, covariances: Covariances, information: Covariances) -> Float[jax.Array, " count"]:
-        """Return the equal weights."""
+        """Return 1 / count for each estimate."""
         return jnp.full(len(information), 1 / len(information))
 
     def neighbour_weights(self, believed: NeighbourEstimates) -> NeighbourWeights:
-        """Intersect with equal shares of what arrived."""
+        """Return the weights of covariance intersection with equal shares of the estimates that arrived."""
         return intersection_weights(believed, equal_shares(believed))
 
 
@@ -215,7 +225,7 @@ class FixedIntersection(AbstractIntersection):
         array("fusion weights", self.weights, (count,))
 
     def weights_of(self, covariances: Covariances, information: Covariances) -> Float[jax.Array, " count"]:
-        """Return the given weights."""
+        """Return the fixed weights, whatever the covariances are."""
         return jnp.asarray(self.weights)
 
 
@@ -245,11 +255,11 @@ class WeightedFusion(AbstractFusion):
         array("fusion weights", self.weights, (count,))
 
     def claim(self, claims: list[Claim]) -> Claim:
-        """Lower the weakest claim to "upper" at most."""
+        """Return the weakest of the claims and "upper": the sum of c_i P_i is a bound, by convexity."""
         return weakest([*claims, "upper"])
 
     def combine(self, means: Means, covariances: Covariances) -> Fused:
-        """Return the sum with the given weights."""
+        """Return the mean sum_i c_i x_i, and the bound sum_i c_i P_i of its error's covariance."""
         weights = jnp.asarray(self.weights)
         return weights @ means, jnp.tensordot(weights, covariances, axes=1)
 

@@ -37,7 +37,10 @@ class SplitIntersection(AbstractIntersection):
     known: Float[Array, "node n node n"]
 
     def __init__(self, known: Float[ArrayLike, "node n *joint"]):
-        """Check P^a, (node, n, node, n), or (node, n, n) of known parts that are independent between nodes."""
+        """Check and hold P^a, the joint covariance of the known parts of the errors, as (node, n, node, n).
+
+        Parts that are independent between nodes may be given as one covariance for each, (node, n, n).
+        """
         values = array("known part", known, (None,) * rank("known part", known))
         # Independent parts: the blocks of a block-diagonal P^a.
         if values.ndim == 3 and values.shape[1] == values.shape[2]:

@@ -42,9 +42,10 @@ class ZoomQuantizer(AbstractQuantizer):
         decay: "Float[ArrayLike, '']",
         growth: "Float[ArrayLike, '']",
     ):
-        """Store a uniform quantizer, and how its amplitude decays at each step and grows with the sent value."""
+        """Check and hold the first uniform quantizer, and the parameters of d+ = decay d + growth x^2."""
         self.uniform = UniformQuantizer(levels, amplitude)
-        self.decay, self.growth = scalar("decay", decay), scalar("growth", growth)
+        self.decay = scalar("decay", decay)
+        self.growth = scalar("growth", growth)
         if not is_traced(self.decay) and not 0 < self.decay < 1:
             raise fail("decay", "a number between 0 and 1", decay)
         if not is_traced(self.growth) and self.growth < 0:
@@ -61,7 +62,8 @@ class ZoomQuantizer(AbstractQuantizer):
 
         The next amplitude is decay times the present one plus growth times x^2; it stays if x is missing.
         """
-        x, amplitude = jnp.asarray(value, dtype=float), jnp.asarray(state, dtype=float)
+        x = jnp.asarray(value, dtype=float)
+        amplitude = jnp.asarray(state, dtype=float)
         next_amplitude = jnp.where(jnp.isfinite(x), self.decay * amplitude + self.growth * x**2, amplitude)
         quantizer_now = eqx.tree_at(lambda quantizer: quantizer.amplitude, self.uniform, amplitude)
         _, quantized = quantizer_now.step((), x)

@@ -84,7 +84,7 @@ class AbstractRandomAffine(Module):
         return any(affine.remembers for affine in inner_maps(self))
 
     def init(self, key: jax.Array) -> PyTree[jax.Array]:
-        """Draw the state before the first draw; it is () for a map that forgets, whose draws are independent."""
+        """Draw the state before the first draw; it is () for a map whose draws are independent over time."""
         memories_inside = memories(self)  # the memories of links inside, by identity
         if not memories_inside:
             return self._init(key)
@@ -102,7 +102,7 @@ class AbstractRandomAffine(Module):
         return draw_with_shared_memories(self, state, key_of_maps, keys)
 
     def _init(self, key: jax.Array) -> PyTree[jax.Array]:
-        """Draw the initial state of a map without memories inside; this default returns () for a map that forgets."""
+        """Draw the initial state of a map without memories inside; by default (), as of independent draws."""
         if self.remembers:
             raise fail(f"init of {type(self).__name__}", "one of its own, since it or a map inside remembers", "none")
         return ()
@@ -130,7 +130,7 @@ class AbstractRandomAffine(Module):
     def moments(self, order: int) -> JointMoments:
         """Return the nominal E[Sym^order(H)], which takes monomials of (y, 1) to means of those of (z, 1).
 
-        The map must forget. A map of your own may return the matrix alone.
+        Draws must be independent over time. A map of your own may return the matrix alone.
 
         Raises:
             ValueError: a matrix of more than the stated memory; a map that remembers, since the moments of one step
@@ -216,7 +216,7 @@ class AbstractRandomAffine(Module):
     # What it is made of: memories, losses, atoms, noises.
 
     def degree_in(self, identity: str) -> int:
-        """Return the degree of H as a polynomial in the state of a memory: one for each map in series that it fades."""
+        """Return the degree of H as a polynomial in a memory's state: 1 for each map in series that it fades."""
         return sum(affine.degree_in(identity) for affine in inner_maps(self))
 
     def condition_on_arrival(self) -> "AbstractRandomAffine":
@@ -230,7 +230,7 @@ class AbstractRandomAffine(Module):
         return self
 
     def list_outcomes(self) -> list["ArrivalOutcome"]:
-        """Return each set of losses that may happen to a map without memory, with its probability, map and arrivals."""
+        """Return each combination of lost outputs of positive probability (one if nothing is lost), with its map."""
         check_forgets("channel with erasures", self)
         if not self.erases:
             return [ArrivalOutcome(1.0, self, np.ones(self.outputs, dtype=bool))]
@@ -257,23 +257,23 @@ class AbstractRandomAffine(Module):
         raise fail("channel", "hops, series, mixtures, stacks and sums of them", type(self).__name__)
 
     def detach_outliers(self) -> tuple["AbstractRandomAffine", AbstractNoise | None]:
-        """Return the map with the mean for its last noise, and that noise, if it has outliers; else itself and None."""
+        """Return the map with the mean of its last noise, and that noise, if it has outliers; else itself and None."""
         return self, None
 
     # How it is written: words, series, hops, and another map beside it.
 
     def in_words(self) -> str:
-        """Return the map in words, such as "Rician hop → hop of gain 1.1"; nothing for one that only selects."""
+        """Return a text such as "Rician hop → hop 1.1" for messages; "" if z are unchanged components of y."""
         return type(self).__name__
 
     @property
     def in_series(self) -> list["AbstractRandomAffine"]:
-        """The maps that this one is a series of, at any depth; itself alone where it is none."""
+        """The maps applied one after another, with z = H_last ... H_1 y; [self] unless the map is a `Series`."""
         return [self]
 
     @property
     def in_parallel(self) -> list["AbstractRandomAffine"]:
-        """The maps whose outputs stand one after another in this one, at any depth; itself alone if it is no stack."""
+        """The maps of one y whose outputs are concatenated to z, at any depth; [self] unless the map is a `Stack`."""
         return [self]
 
     def covers(self, actual: "AbstractRandomAffine", same_noise: SameNoise) -> bool:
@@ -291,12 +291,12 @@ class AbstractRandomAffine(Module):
         return len(assumed_series) == len(actual_series) and all(x.covers(y, same_noise) for x, y in pairs)
 
     def covers_kind(self, actual: "AbstractRandomAffine", same_noise: SameNoise) -> bool:
-        """Return `covers(actual)` where neither map is a series; by default, whether they are equal."""
+        """Return `covers(actual)` for two maps that are no series: by default, whether they are equal."""
         return are_same(self, actual)
 
     @property
     def is_silent(self) -> bool:
-        """True if the map is known to deliver noise alone, as a loss or a mode without reception does."""
+        """True if z = n whatever y is, as in a packet loss or in a mode without reception."""
         return False
 
     def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple["AbstractRandomAffine", ChannelPosition]:
@@ -332,15 +332,15 @@ def all_inner_maps(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]:
 def replace_inner_maps(channel: T, maps: Sequence[AbstractRandomAffine]) -> T:
     """Return the map with these maps in place of its `inner_maps`, or the map itself if they are the same objects."""
     leaves, tree = _flatten_to_inner_maps(channel)  # each inner map is a leaf
-    are_maps, next_map = [isinstance(leaf, AbstractRandomAffine) for leaf in leaves], iter(maps)
-    changed = [next(next_map) if is_map else leaf for is_map, leaf in zip(are_maps, leaves, strict=True)]
+    next_map = iter(maps)
+    changed = [next(next_map) if isinstance(leaf, AbstractRandomAffine) else leaf for leaf in leaves]
     are_unchanged = all(after is before for after, before in zip(changed, leaves, strict=True))
     result: T = channel if are_unchanged else jax.tree.unflatten(tree, changed)
     return result
 
 
 def _flatten_to_inner_maps(channel: object) -> tuple[list[PyTree], jax.tree_util.PyTreeDef]:
-    """Return the leaves of a map, the maps inside it being leaves, and their tree."""
+    """Flatten a map as a JAX pytree, but keep the maps among its fields whole; return the leaves and the tree."""
     return jax.tree.flatten(channel, is_leaf=lambda x: x is not channel and isinstance(x, AbstractRandomAffine))
 
 
@@ -354,7 +354,7 @@ def count_corners(channel: AbstractRandomAffine) -> int | None:
 
 
 class ArrivalOutcome(NamedTuple):
-    """Set of losses that the receiver can observe: with `probability` the outputs in `arrived` come through `map`."""
+    """With `probability` just the outputs in `arrived` arrive, by the random affine map `map`; the receiver sees it."""
 
     probability: float | jax.Array
     map: AbstractRandomAffine
@@ -362,20 +362,20 @@ class ArrivalOutcome(NamedTuple):
 
 
 class AbstractModal(AbstractWithMemory, AbstractRandomAffine):
-    """Random affine map whose law at each step depends on the state of a memory."""
+    """Random affine map whose law at each step depends on a state, such as a Markov chain's: the link's memory."""
 
     @property
     def remembers(self) -> bool:
-        """Always True."""
+        """Always True: the law of H depends on the state of the memory."""
         return True
 
     def given(self, state: int | float | jax.Array | np.ndarray) -> AbstractRandomAffine:
-        """Return the map, without memory, for this state of the memory."""
+        """Return the map z = G y + n that the link is while its memory has this state; it has no memory itself."""
         raise unwritten(self, "given")
 
     @property
     def memory_in_words(self) -> str:
-        """Name of the memory and a colon; nothing where it has none."""
+        """Name of the memory and a colon, as a prefix of texts such as "'fading': hop"; "" if it has no name."""
         return "" if self.memory.name is None else f"{self.memory.name!r}: "
 
     def degree_in(self, identity: str) -> int:
@@ -395,6 +395,6 @@ def check_maps(name: str, maps: Sequence[AbstractRandomAffine]) -> tuple[Abstrac
 
 
 def check_forgets(name: str, channel: AbstractRandomAffine) -> None:
-    """Raise ValueError where a map remembers, for what knows only laws that are independent over time."""
+    """Raise ValueError, about what is called `name`, unless the draws of the map are independent over time."""
     if channel.remembers:
         raise fail(name, "one that forgets", f"{type(channel).__name__}, which remembers")

@@ -67,7 +67,7 @@ class AbstractToldMap(AbstractModal):
 
     @property
     def optional(self) -> bool:
-        """True if a filter can use z also where the reported numbers are missing (NaN); by default it cannot."""
+        """True if a filter can use z even if the message's reported numbers are missing (NaN); by default False."""
         return False
 
     @property
@@ -119,16 +119,14 @@ class ToldMap(AbstractToldMap):
         exogenous: bool = True,
         fresh: bool = True,
     ):
-        """Hold the memory that draws the numbers, and the function `make` from numbers (count,) to a map.
+        """Hold a link z = G y + n whose law is make(numbers), for the numbers that `memory` draws at each step.
 
-        A map is a link z = G y + n with random G and n; the numbers, such as a variance, come with each message and say
-        its law. make(typical), the map of an example, is checked and gives the sizes. `names` are those of the numbers.
-        `exogenous`: the numbers are independent of the plant's state. `fresh`: given the numbers, the map is drawn
-        independently with each message. Delays and erasures belong outside: delay(told map), not told map of a delay.
+        `make` must return a map without memory, delay or erasures; make(typical), that of an example, is checked. A
+        delay belongs outside, as a delay of this map: its numbers come with the message, and are of the same time.
         """
         self.memory, self.make, self.example, self.names = memory, make, typical, names
         self.exogenous, self.fresh = exogenous, fresh
-        link = in_float64(make)(typical)
+        link = in_float64(make)(typical)  # for the checks and the sizes
         if not isinstance(link, AbstractRandomAffine):
             raise fail("link of what a message tells", "a function that returns a link", show_value(link))
         check_forgets("link of what a message tells", link)
@@ -139,13 +137,15 @@ class ToldMap(AbstractToldMap):
 
     @property
     def outputs(self) -> int:
-        """Length of z."""
-        return self.sizes[0]
+        """Length of z, that of the map of the example numbers."""
+        outputs, _ = self.sizes
+        return outputs
 
     @property
     def inputs(self) -> int:
-        """Length of y."""
-        return self.sizes[1]
+        """Length of y, that of the map of the example numbers."""
+        _, inputs = self.sizes
+        return inputs
 
     @property
     def typical(self) -> Numbers:
@@ -153,7 +153,7 @@ class ToldMap(AbstractToldMap):
         return self.example
 
     def given(self, state: int | float | jax.Array | np.ndarray) -> AbstractRandomAffine:
-        """Return make(numbers) for the numbers of this state of the memory."""
+        """Return make(numbers), the link itself, for the numbers that a message reports of this memory state."""
         return self.believed(self.memory.announce(state))
 
     def believed(self, numbers: Numbers) -> AbstractRandomAffine:
@@ -168,7 +168,8 @@ class ToldMap(AbstractToldMap):
         """
         if isinstance(self.make, ToldGainHop):
             return super().numbers_give_law(numbers)
-        link, typical_link = self.believed(numbers), self.believed(jnp.asarray(self.typical))
+        link = self.believed(numbers)
+        typical_link = self.believed(jnp.asarray(self.typical))
         finite = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(link) if eqx.is_array(leaf)]
         pairs = zip(_list_noise_covariances(link), _list_noise_covariances(typical_link), strict=True)
         valid = [_is_covariance(matrix, typical) for matrix, typical in pairs]
@@ -213,7 +214,10 @@ class PilotedHop(AbstractHop, AbstractToldMap):
         The one reported number is named "pilot". It is exogenous: link and plant are independent. `fresh`: given its
         reading, the gain is drawn independently with each message.
         """
-        self.memory, self.matrix, self.noise, self.names = memory, matrix, noise, ("pilot",)
+        self.memory = memory
+        self.matrix = matrix
+        self.noise = noise
+        self.names = ("pilot",)
         self.exogenous, self.fresh = True, fresh
 
     @property
@@ -223,7 +227,10 @@ class PilotedHop(AbstractHop, AbstractToldMap):
 
     @property
     def typical(self) -> Numbers:
-        """An example of the reported reading (1,): the mean gain E[g]."""
+        """An example of the number that each message reports, a reading a = g + e of the gain: (E[g],), shape (1,).
+
+        It is used to find the shapes and the kind of the map, not as an estimate.
+        """
         numbers: Numbers = library(self.memory.law).stack([self.memory.law.moment(1)])
         return numbers
 
@@ -232,7 +239,7 @@ class PilotedHop(AbstractHop, AbstractToldMap):
         return GainAndNoise(Constant(jnp.asarray(state)[0]), self.matrix, self.noise)
 
     def numbers_give_law(self, numbers: Numbers) -> jax.Array:
-        """Return True: with no finite reading the gain has the law that it has before any reading."""
+        """Return True always: if the reading is missing, the gain has its law p(g) before any reading."""
         return jnp.asarray(True)
 
     def believed(self, numbers: Numbers) -> GainAndNoise:
@@ -306,12 +313,15 @@ def numbers_give_law(channel: AbstractRandomAffine, numbers: Numbers) -> jax.Arr
         channel: a channel.
         numbers: the reported numbers of all its maps, concatenated in the order of `list_told_maps`.
     """
-    by_memory, told_maps = _share_numbers_by_map(channel, numbers), list_told_maps(channel)
-    return jnp.all(jnp.stack([affine.numbers_give_law(by_memory[affine.memory.identity]) for affine in told_maps]))
+    numbers_by_memory = _share_numbers_by_map(channel, numbers)
+    valid = []  # for each map, whether its numbers give it a law
+    for affine in list_told_maps(channel):
+        valid.append(affine.numbers_give_law(numbers_by_memory[affine.memory.identity]))
+    return jnp.all(jnp.stack(valid))
 
 
 def _share_numbers_by_map(channel: object, numbers: Numbers) -> dict[str, Numbers]:
-    """Split the reported numbers of all maps, and return those of each map by the identity of its memory."""
+    """Split the concatenated reported numbers of all maps; return those of each, with its memory's identity as key."""
     assert isinstance(channel, AbstractRandomAffine)
     numbers_by_memory, start = dict[str, Numbers](), 0
     for affine in list_told_maps(channel):
@@ -321,7 +331,7 @@ def _share_numbers_by_map(channel: object, numbers: Numbers) -> dict[str, Number
 
 
 def _list_noise_covariances(link: AbstractRandomAffine) -> list[jax.Array | np.ndarray]:
-    """Return the covariances of all noises in a link."""
+    """Return the covariance of each noise inside a link, in the order of its leaves."""
     leaves = jax.tree.leaves(link, is_leaf=lambda leaf: isinstance(leaf, AbstractNoise))
     return [leaf.covariance for leaf in leaves if isinstance(leaf, AbstractNoise)]
 
@@ -336,7 +346,9 @@ def _is_covariance(matrix: jax.Array | np.ndarray, typical: jax.Array | np.ndarr
 
 
 def make_laws_certain(link: T) -> T:
-    """Return a link whose laws of finitely many gains or modes count as certain, even where their numbers are traced.
+    """Return a link in which the probabilities of finitely many gains, or of modes, count as certain.
+
+    JAX may trace them, so that a test whether they are uncertain has no answer.
 
     Raises:
         ValueError: probabilities that may be off.

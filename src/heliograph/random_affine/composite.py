@@ -14,11 +14,14 @@ from heliograph.numerics.types import PyTree
 from heliograph.random_affine.base import AbstractRandomAffine, inner_maps, replace_inner_maps
 from heliograph.random_affine.moments.signal_path import ChannelPosition, Visit, refuse_gain_on_angles
 
-ARROW, DIRECT = " → ", "direct"  # between maps in series, and of one that only selects
+ARROW, DIRECT = " → ", "direct"  # texts between maps in series, and for a map that only selects components
 
 
 class AbstractComposite(AbstractRandomAffine):
-    """Random affine map made of independent others, whose moments are linear in the law of each."""
+    """Random affine map made of independent maps (`parts`); its moments are linear in the law of each of them.
+
+    So its extreme laws, at which bounds are reached, are the combinations of extreme laws of the parts.
+    """
 
     @property
     def parts(self) -> Sequence[AbstractRandomAffine]:
@@ -26,15 +29,16 @@ class AbstractComposite(AbstractRandomAffine):
         return inner_maps(self)
 
     def rebuilt(self, *parts: AbstractRandomAffine) -> AbstractRandomAffine:
-        """Return the same map made of others."""
+        """Return the same kind of map made of these maps in place of its own `parts`."""
         return replace_inner_maps(self, parts)
 
     def extremes(self) -> tuple[AbstractRandomAffine, ...]:
-        """Return the same map made of each combination of the parts' extremes."""
-        return tuple(self.rebuilt(*parts) for parts in product(*(affine.extremes() for affine in self.parts)))
+        """Return the same map made of each combination of one extreme law of each part."""
+        combinations = product(*(affine.extremes() for affine in self.parts))
+        return tuple(self.rebuilt(*parts) for parts in combinations)
 
     def corner_count(self) -> int:
-        """Return the product of the parts' counts."""
+        """Return the number of combinations of one extreme law of each part."""
         return prod(affine.corner_count() for affine in self.parts)
 
     def mean_gain(self) -> AbstractRandomAffine:
@@ -56,7 +60,7 @@ class AbstractMapWrapper(AbstractComposite):
         return self.parts[0].inputs
 
     def _init(self, key: jax.Array) -> PyTree[jax.Array]:
-        """Return the state of the part."""
+        """Draw the initial state of the one map inside, which is the state of this map."""
         return self.parts[0].init(key)
 
 
@@ -107,5 +111,5 @@ def describe_maps_side_by_side(maps: Sequence[AbstractRandomAffine]) -> str:
 
 
 def write_percentage(share: object) -> str:
-    """Return a share as a percentage of three digits."""
+    """Return a share from 0 to 1 as a text in percent with three digits, such as 2.5%."""
     return f"{100 * float(np.asarray(share)):.3g}%"

@@ -29,7 +29,7 @@ T = TypeVar("T")
 
 
 class AbstractDelayLine(AbstractMapWrapper):
-    """Map of the tapped delay line (y_k, y_{k-1}, ..., y_{k-past}), stacked."""
+    """Link with a delay, as a map of the delay line (y_k, y_{k-1}, ..., y_{k-past}) of the last signals, stacked."""
 
     @property
     def line(self) -> AbstractRandomAffine:
@@ -50,7 +50,10 @@ class AbstractDelayLine(AbstractMapWrapper):
         return self.line.draw(state, key)
 
     def moments(self, order: int) -> JointMoments:
-        """Return E[Sym^order(H)] of `line`, the map of the stacked signals."""
+        """Return E[Sym^order(H)] of `line`, the map of the stacked signals.
+
+        Sym^order(H) maps the monomials of (y, 1) of this degree to those of (z, 1).
+        """
         return self.line.moments(order)
 
 
@@ -98,7 +101,10 @@ class DelayLine(AbstractDelayLine):
         return f"{self.link.in_words() or DIRECT}, of the last {self.steps + 1} signals"
 
     def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
-        """Return the map with visit(name, hop, signal) in place of each hop of the link, which receives the line."""
+        """Return the map with visit(name, hop, signal) in place of each hop of the link, which receives the line.
+
+        A hop is a transmitter with its link. `position` has the name and number of the next one, and the signal there.
+        """
         plain, position = self.link.visit_hops(visit, position.on_delay_line(self.inputs // signal_size(self)))
         return replace_inner_maps(self, [plain]), position
 
@@ -121,7 +127,11 @@ class DelayedLink(AbstractDelayLine):
     timestamped: bool = eqx.field(static=True)
 
     def __init__(self, link: AbstractRandomAffine, delay: Delay, timestamped: bool = False):
-        """Hold the link and, for each possible delay d, the selection S_d of y_{k-d} with its probability or mode."""
+        """Hold the link, and the delay as a map of its own from the line (y_k, y_{k-1}, ...) to the link's input.
+
+        For a delay of d steps that map is the selection S_d, which takes y_{k-d} from the line. For a random delay it
+        is a mixture of these with its probabilities, and for a chain one selection for each mode.
+        """
         (self.link,) = check_maps("delayed link", [link])
         if link.past:
             raise fail("delayed link", "one that is not late itself", f"one late by up to {link.past} steps")
@@ -151,12 +161,12 @@ class DelayedLink(AbstractDelayLine):
 
     @property
     def past(self) -> int:
-        """Longest delay in steps."""
+        """Longest possible delay in steps, which is the number of past signals in the delay line."""
         return max(self.times)
 
     @property
     def constant(self) -> bool:
-        """True if the delay never varies."""
+        """True if the delay is one number of steps, and not drawn from a law or given by a chain."""
         return isinstance(self.delay, GainAndNoise)
 
     def carry_angles(self, sent: Angles) -> Angles:
@@ -169,7 +179,10 @@ class DelayedLink(AbstractDelayLine):
         return f"{self.link.in_words() or DIRECT}, {late}"
 
     def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
-        """Return the map with visit(name, hop, signal) in place of each hop of the link, and the position behind it."""
+        """Return the map with visit(name, hop, signal) in place of each hop of the link, and the position behind it.
+
+        A hop is a transmitter with its link. `position` has the name and number of the next one, and the signal there.
+        """
         link, position = self.link.visit_hops(visit, position)
         return replace_inner_maps(self, [link, self.delay]), position
 
@@ -224,7 +237,7 @@ def place_on_delay_line(channel: T) -> T:
 
 
 def signal_size(channel: AbstractRandomAffine) -> int:
-    """Return the numbers that are sent to a channel at each step."""
+    """Return how many numbers are sent to a channel at each step: its inputs, without those of past signals."""
     return channel.inputs // (1 + channel.past)
 
 

@@ -28,7 +28,7 @@ class Erasure(AbstractMapWrapper):
 
     @property
     def erases(self) -> bool:
-        """Always True."""
+        """Always True: outputs may be lost, and are NaN then."""
         return True
 
     def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
@@ -47,7 +47,8 @@ class Erasure(AbstractMapWrapper):
 
         An outcome has its probability, the map given it, and which outputs arrive.
         """
-        arrival, none_arrives = plain(self.arrival), np.zeros(self.outputs, dtype=bool)
+        arrival = plain(self.arrival)
+        none_arrives = np.zeros(self.outputs, dtype=bool)
         outcomes = [
             outcome._replace(probability=arrival * outcome.probability) for outcome in self.base.list_outcomes()
         ]
@@ -59,13 +60,15 @@ class Erasure(AbstractMapWrapper):
         return self.base.carry_angles(sent)
 
     def in_words(self) -> str:
-        """Return the map in words, and how much of it is lost."""
+        """Return a text such as "Rician hop, 5% lost"."""
         return f"{self.base.in_words() or DIRECT}, {write_percentage(1 - self.arrival)} lost"
 
     def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
         """Return the erasure with visit(name, hop, signal) in place of each hop inside, and the position behind it.
 
         Hops send whether they are received or not, so that they receive the same signal as without the erasure.
+
+        A hop is a transmitter with its link. `position` has the name and number of the next one, and the signal there.
         """
         base, position = self.base.visit_hops(visit, position)
         return self.rebuilt(base), position

@@ -26,8 +26,8 @@ from heliograph.random_affine.moments.monomials import (
 from heliograph.random_affine.moments.signal_path import ChannelPosition, Visit, refuse_gain_on_angles
 from heliograph.random_affine.noises.noise import AbstractNoise, Gaussian, Matrix, Vector, as_noise, noise_moment_vector
 
-NOTHING_SENT = "nothing sent"  # in words
-ROUNDING = 1e-12  # of a gain of 1 that was computed
+NOTHING_SENT = "nothing sent"  # text for a hop whose matrix A is zero
+ROUNDING = 1e-12  # a computed gain this near to 1 is taken as 1
 
 
 class AbstractHop(AbstractRandomAffine):
@@ -38,22 +38,22 @@ class AbstractHop(AbstractRandomAffine):
 
     @property
     def outputs(self) -> int:
-        """Length of z."""
+        """Length of z = g A y + n: the number of rows of A."""
         return int(self.matrix.shape[-2])
 
     @property
     def inputs(self) -> int:
-        """Length of y."""
+        """Length of the signal y that is sent through this hop z = g A y + n: the number of columns of A."""
         return int(self.matrix.shape[-1])
 
     @property
     def transmits(self) -> bool:
-        """True of a radio; False of a wire, which passes its input on without gain and noise."""
+        """True for a radio; False for a wire, z = A y: a gain g that is the constant 1, and no noise."""
         return not (self._gain_is_one and is_zero(self.noise.covariance))
 
     @property
     def _gain_is_one(self) -> bool:
-        """True of a gain that is known to be one; by default none is."""
+        """True if the gain g is known to be the constant 1; by default it is not known."""
         return False
 
     def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
@@ -61,6 +61,8 @@ class AbstractHop(AbstractRandomAffine):
 
         The name is the position's prefix and "hop" with the hop's number in the chain; the signal is the second moment
         of what the hop receives. A wire, which does not transmit, is returned unchanged, with the same position.
+
+        A hop is a transmitter with its link. `position` has the name and number of the next one, and the signal there.
         """
         if not self.transmits:
             return self, position
@@ -101,7 +103,8 @@ class GainAndNoise(AbstractHop):
         gain_key, noise_key = jax.random.split(key)
         gain = self.law.sample(gain_key) * jnp.asarray(self.matrix)
         noise = self.noise.sample(noise_key)[:, None]
-        top, bottom = jnp.concatenate([gain, noise], axis=1), np.eye(1, self.inputs + 1, self.inputs)
+        top = jnp.concatenate([gain, noise], axis=1)
+        bottom = np.eye(1, self.inputs + 1, self.inputs)
         return jnp.concatenate([top, bottom], axis=0)
 
     @property
@@ -111,7 +114,10 @@ class GainAndNoise(AbstractHop):
 
     @cache_by_object
     def moments(self, order: int) -> JointMoments:
-        """Return E[Sym^order(H)] = sum_k E[g^k] B_k: moments of the gain g, and B_k the `gain_coefficients`."""
+        """Return E[Sym^order(H)] = sum_k E[g^k] B_k: moments of the gain g, and B_k the `gain_coefficients`.
+
+        Sym^order(H) maps the monomials of (y, 1) of this degree to those of (z, 1).
+        """
         gains = tabulate_gain_moments(self.law, order)
         coefficients = self.gain_coefficients(order)
         return JointMoments(
@@ -125,7 +131,8 @@ class GainAndNoise(AbstractHop):
         The axes are k, the monomials of (z, 1), and those of (y, 1). B_k has the terms with |b| = k of
         E[prod_i (g (A y)_i + n_i)^a_i] = sum_{b <= a} C(a, b) E[g^|b|] (A y)^b E[n^(a-b)].
         """
-        rows, columns = count_monomials(self.outputs + 1, order), count_monomials(self.inputs + 1, order)
+        rows = count_monomials(self.outputs + 1, order)
+        columns = count_monomials(self.inputs + 1, order)
         refuse_if_too_large(rows, columns, f"moments of order {order}")
         of_known_map = symmetric_power(affine_matrix(self.matrix), order)  # rows (A y)^b, made homogeneous with 1
         row, column, remainder, binomials = plan_binomial_sums(self.outputs, order)
@@ -148,7 +155,8 @@ class GainAndNoise(AbstractHop):
         Sym^order(H) takes the monomials of (y, 1) of this degree to those of (z, 1), and the B_k are the
         `gain_coefficients`. An extreme law is a vertex of the polytope of possible probabilities of g.
         """
-        gains, coefficients = self.law.corner_moments(order), self.gain_coefficients(order)
+        gains = self.law.corner_moments(order)
+        coefficients = self.gain_coefficients(order)
         moment_map: jax.Array | np.ndarray = library(gains, coefficients).tensordot(gains, coefficients, axes=1)
         return moment_map
 
@@ -164,7 +172,8 @@ class GainAndNoise(AbstractHop):
         for b, (low, high) in zip(coefficients, gain_intervals, strict=True):
             lows.append(xp.minimum(b * low, b * high))
             highs.append(xp.maximum(b * low, b * high))
-        return sum(lows), sum(highs)
+        lowest, highest = sum(lows), sum(highs)
+        return lowest, highest
 
     def covers_kind(self, actual: AbstractRandomAffine, same_noise: SameNoise) -> bool:
         """Return whether `actual` is a hop with this matrix and noise, and a law of the gain that is possible here."""
@@ -179,7 +188,14 @@ class GainAndNoise(AbstractHop):
         return are_known
 
     def carry_angles(self, sent: Angles) -> Angles:
-        """Return the indices of the outputs that are angles: each must take one angle by a gain of 1, and no more."""
+        """Return the indices of the outputs of z = g A y + n that are angles, from those of y (`sent`).
+
+        An output that takes an angle must take a single one by the gain 1, and no other angle; whole multiples or sums
+        of angles are refused.
+
+        Raises:
+            ValueError: an angle with a random, unknown or other gain.
+        """
         if not sent:
             return ()
         if is_traced(self.matrix):
@@ -191,7 +207,7 @@ class GainAndNoise(AbstractHop):
         gain = self.law.constant
         if gain is None or is_traced(gain):
             raise refuse_gain_on_angles(f"a gain that is {type(self.law).__name__}")
-        # Gains of 0 or more that are whole and sum to 1: a single one that is 1.
+        # In each row of g A the gains must be whole, at least 0, and sum to 1: then a single one is 1, the others 0.
         gains = float(gain) * np.asarray(self.matrix)[taking]
         are_whole = np.abs(gains - np.round(gains)) <= ROUNDING
         if not np.all(are_whole & (np.round(gains) >= 0)) or np.any(np.round(gains).sum(axis=1) != 1):
@@ -201,10 +217,14 @@ class GainAndNoise(AbstractHop):
     def list_atoms(self) -> list[AffineComponent]:
         """Return every combination of a value g of the gain with an atom n = c + N(0, R) of the noise.
 
-        A combination has the product of both probabilities, and is the map y -> g A y + c + N(0, R).
+        A combination has the product of both probabilities, P(g) P(atom), and is the map y -> g A y + c + N(0, R).
         """
-        gains, noises = self.law.list_atoms(), self.noise.list_atoms()
-        return [AffineComponent(p * q, g * self.matrix, c, R) for p, g in gains for q, c, R in noises]
+        atoms = []
+        for probability_of_gain, g in self.law.list_atoms():
+            for probability_of_atom, c, R in self.noise.list_atoms():
+                weight = probability_of_gain * probability_of_atom
+                atoms.append(AffineComponent(weight, g * self.matrix, c, R))
+        return atoms
 
     def disturb_gain(self) -> DisturbedGain:
         """Return E[H_ab] and E[H_ab H_ij] of H = [g A, N], where N N' is the covariance of the noise.
@@ -251,7 +271,7 @@ class GainAndNoise(AbstractHop):
 
     @property
     def _gain_is_one(self) -> bool:
-        """True of a gain that is known to be one."""
+        """True if the gain g is the constant 1, and its value is known now (not traced by JAX)."""
         gain = self.law.constant
         return gain is not None and not is_traced(gain) and float(gain) == 1.0
 
@@ -263,15 +283,16 @@ class GainAndNoise(AbstractHop):
 def affine_matrix(matrix: Matrix) -> Matrix:
     """Return [[A, 0], [0, 1]], which maps (y, 1) to (A y, 1)."""
     outputs, inputs = matrix.shape
-    zero_column, last_row = np.zeros((outputs, 1)), np.eye(1, inputs + 1, inputs)
+    zero_column = np.zeros((outputs, 1))
+    last_row = np.eye(1, inputs + 1, inputs)
     xp = library(matrix)
     extended: Matrix = xp.concatenate([xp.concatenate([matrix, zero_column], axis=1), last_row])
     return extended
 
 
 def tabulate_gain_moments(law: AbstractLaw, order: int) -> Vector:
-    """Return E[g^k] for k = 0, ..., order."""
-    moment = law.moment  # of a module, whose methods are slow to look up
+    """Return the moments E[g^k] of a gain, k = 0, ..., order; shape (order + 1,)."""
+    moment = law.moment  # looked up once: attribute access of a module is slow
     return stack_parts([moment(k) for k in range(order + 1)])
 
 

@@ -63,11 +63,11 @@ class AbstractMemory(Module):
         return False
 
     def begin(self, key: jax.Array) -> jax.Array:
-        """Draw the initial state."""
+        """Draw the state at the first use of the link."""
         raise unwritten(self, "begin")
 
     def move(self, state: jax.Array, key: jax.Array) -> jax.Array:
-        """Draw the next state."""
+        """Draw the next state, given the present one."""
         raise unwritten(self, "move")
 
     def nodes(self, degree: int) -> MemoryStates:
@@ -85,18 +85,19 @@ class AbstractMemory(Module):
         return numbers
 
     def state_from_number(self, number: jax.Array) -> jax.Array:
-        """Return the state that a received number stands for."""
+        """Return the state of which a message reports this number."""
         raise unwritten(self, "state_from_number")
 
     def next_state_quadrature(self, state: jax.Array | None, degree: int) -> tuple[jax.Array | np.ndarray, Law]:
-        """Return the points and weights for the next state's law given this one (None: for the law at the first use).
+        """Return points and weights of a quadrature of the next state s+ given the present `state`.
 
-        Exact for polynomials of twice the `degree` in the state.
+        E[f(s+)] = sum_i weight_i f(point_i), exact for polynomials f of up to twice the `degree`. If `state` is None,
+        the quadrature is for the law of the first state.
         """
         raise unwritten(self, "next_state_quadrature")
 
     def labelled(self, label: str) -> "AbstractMemory":
-        """Return a copy without a name, which only `label` identifies."""
+        """Return a copy without a name, with `label` as identity: only copies of this label share its state."""
         labelled_copy = copy(self)  # a construction would check numbers that may be stacked over time
         object.__setattr__(labelled_copy, "name", None)  # fields are frozen
         object.__setattr__(labelled_copy, "identity", label)
@@ -153,7 +154,7 @@ class MarkovChain(AbstractMemory):
 
     @property
     def is_uncertain(self) -> bool:
-        """True if some transition has a radius."""
+        """True if some transition probability is known only within a radius."""
         return bool(np.any(self.radius > 0))
 
     def covers(self, actual: "MarkovChain") -> bool:
@@ -175,7 +176,7 @@ class MarkovChain(AbstractMemory):
         return draw_index(self.initial, key)
 
     def move(self, state: jax.Array, key: jax.Array) -> jax.Array:
-        """Draw the next mode."""
+        """Draw the next mode j with P(j) = transition[state, j]."""
         return draw_index(jnp.asarray(self.transition)[state], key)
 
     def nodes(self, degree: int) -> MemoryStates:
@@ -183,11 +184,11 @@ class MarkovChain(AbstractMemory):
         return MemoryStates(np.arange(self.modes), self.initial, self.transition, self.radius)
 
     def state_from_number(self, number: jax.Array) -> jax.Array:
-        """Return the nearest mode from below."""
+        """Return the number without its fraction, as a mode from 0 to `modes` - 1."""
         return jnp.clip(jnp.asarray(number).astype(int), 0, self.modes - 1)
 
     def next_state_quadrature(self, state: jax.Array | None, degree: int) -> tuple[jax.Array | np.ndarray, Law]:
-        """Return the modes with their probabilities."""
+        """Return the modes (modes,) and their probabilities: exact, so that `degree` does not matter."""
         law = jnp.asarray(self.initial) if state is None else jnp.asarray(self.transition)[state]
         return jnp.arange(self.modes), law
 
@@ -208,7 +209,7 @@ class CertainChain(MarkovChain):
 
     @property
     def is_uncertain(self) -> bool:
-        """Always False."""
+        """Always False: the constructor refused uncertain transitions, and traced ones cannot be asked."""
         return False
 
 
@@ -234,15 +235,15 @@ class Autoregression(AbstractMemory):
 
     @property
     def drifts(self) -> bool:
-        """Always True."""
+        """Always True: the state is a real number."""
         return True
 
     def begin(self, key: jax.Array) -> jax.Array:
-        """Draw N(0, 1)."""
+        """Draw the first state c from N(0, 1), the stationary law."""
         return jax.random.normal(key, dtype=float)
 
     def move(self, state: jax.Array, key: jax.Array) -> jax.Array:
-        """Return rho c + sqrt(1 - rho^2) e."""
+        """Draw the next state c+ = rho c + sqrt(1 - rho^2) e from the present one c (`state`), with e of N(0, 1)."""
         rho = jnp.asarray(self.correlation)
         return rho * state + jnp.sqrt(1 - rho**2) * jax.random.normal(key, dtype=float)
 
@@ -296,7 +297,11 @@ class Autoregression(AbstractMemory):
 
 
 def find_stationary_law(transition: Rows) -> Law:
-    """Return the stationary law p = p Pi of a chain; raise ValueError if it has several."""
+    """Return the stationary law p of a chain with the transition matrix Pi: p = p Pi and sum p = 1.
+
+    Raises:
+        ValueError: several stationary laws, as the rank of Pi - I shows (not checked if Pi is traced).
+    """
     m = len(transition)
     xp = library(transition)
     if not is_traced(transition) and np.linalg.matrix_rank(transition - np.eye(m), tol=PROBABILITY_TOLERANCE) < m - 1:
@@ -336,7 +341,7 @@ def _hermite_quadrature(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def unique_memories(all_memories: Iterable[AbstractMemory]) -> dict[str, AbstractMemory]:
-    """Return the memories by identity, each once, in order of appearance.
+    """Return the memories in order of appearance, each once, by their identities (texts by which maps share them).
 
     Raises:
         ValueError: memories of one identity (of one name) that differ.

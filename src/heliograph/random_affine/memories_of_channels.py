@@ -16,12 +16,12 @@ T = TypeVar("T")
 
 
 class AbstractWithMemory(Module):
-    """Whatever has a law at each step that depends on the state of a memory."""
+    """A model whose law at each step depends on the state of its `memory`: a Markov chain's mode, a drifting gain."""
 
     memory: eqx.AbstractVar[AbstractMemory]
 
     def given(self, state: int | float | jax.Array | np.ndarray) -> Any:
-        """Return the same without memory, for this state of the memory."""
+        """Return the model that this one is while its memory has this state; it has no memory itself."""
         raise unwritten(self, "given")
 
 
@@ -42,7 +42,11 @@ def select_model_of_equal_structure(models: Sequence[T], state: jax.Array) -> T 
 
 
 class ChannelState(NamedTuple):
-    """State of a channel: of its memories, in order of appearance, and of the map given them."""
+    """State of a channel that remembers.
+
+    memories: state of each of its memories, in the order of `memories(channel)`. rest: state of the map that the
+    channel is given these states; () if that map is independent over time.
+    """
 
     memories: tuple[jax.Array, ...]
     rest: PyTree[jax.Array]
@@ -68,7 +72,11 @@ def draw_with_shared_memories(
 
 
 def memories(channel: PyTree) -> dict[str, AbstractMemory]:
-    """Return the memories on which the modes of a map (or of all maps in a tree) depend, by identity, in order."""
+    """Return the memories on which the maps in a channel (or in any tree of models) depend, in order of appearance.
+
+    The key is the memory's identity, a text. Maps whose memories have one identity share one state, so that such a
+    memory is listed once.
+    """
     parts = jax.tree.leaves(channel, is_leaf=is_memory_dependent)
     return unique_memories(leaf.memory for leaf in parts if is_memory_dependent(leaf))
 
@@ -107,7 +115,8 @@ def drop_names(channel: T) -> T:
 def number_unnamed_memories(model: T) -> T:
     """Return the model with its unnamed memories identified by numbers instead of random texts.
 
-    So models that differ only in these texts become equal.
+    The identity of a memory is the text by which maps share it; without a name it is random. So models that differ only
+    in these texts become equal.
     """
     numbered = enumerate(memories(model).items())
     labelled = {key: memory.labelled(f"unnamed {i}") for i, (key, memory) in numbered if memory.name is None}
@@ -132,11 +141,11 @@ def separate_memories(maps: Sequence[T]) -> list[T]:
 
 
 def align_memories_over_time(maps: Sequence[T]) -> list[T]:
-    """Return the maps of all steps, where each unnamed memory has the identity of its counterpart in the first step.
+    """Return the maps of all steps such that the state of each memory goes on from step to step.
 
-    Maps with memories of equal identity share one state, so that it then goes on from step to step. Memories are
-    matched in order of appearance. If the first map has no memory, or if steps have different numbers of memories, the
-    maps are returned unchanged.
+    Memories share a state if they have the same identity, a text. So each memory without a name gets the identity of
+    its counterpart in the first step, in order of appearance. If the first map has no memory, or if steps have
+    different numbers of memories, the maps are returned unchanged.
     """
     memories_by_map = [memories(affine) for affine in maps]
     if not memories_by_map[0] or len({len(memories_of_map) for memories_of_map in memories_by_map}) > 1:
@@ -156,7 +165,7 @@ def replace_memories(channel: T, replacements: Mapping[str, AbstractMemory]) -> 
     """Return the map with some memories replaced: `replacements` has the new memory by the identity of the old one."""
 
     def replace(leaf: PyTree) -> PyTree:
-        """Return a map with its memory replaced; return anything else unchanged."""
+        """Return a model with its memory replaced, if a new one is given; return anything else unchanged."""
         if not is_memory_dependent(leaf) or leaf.memory.identity not in replacements:
             return leaf
         return eqx.tree_at(lambda m: m.memory, leaf, replacements[leaf.memory.identity])

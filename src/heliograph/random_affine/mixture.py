@@ -40,7 +40,10 @@ class Mixture(AbstractOneOfSeveralMaps, AbstractCombination):
         weights: "Float[ArrayLike, ' maps']",
         radius: "Float[ArrayLike, '*maps']" = 0.0,
     ):
-        """Hold the maps and their probabilities `weights`, each uncertain by up to `radius`."""
+        """Hold the maps and their probabilities `weights`, each uncertain by up to `radius`.
+
+        `choice` is the law of the number of the map that is drawn.
+        """
         self.maps = check_maps("mixture", maps)
         self.choice = Discrete(np.arange(len(self.maps)), weights, radius)
         self.check_shapes("mixture")
@@ -54,7 +57,10 @@ class Mixture(AbstractOneOfSeveralMaps, AbstractCombination):
 
     @cache_by_object
     def moments(self, order: int) -> JointMoments:
-        """Return sum_i p_i E[Sym^order(H_i)], p_i the probability of map i."""
+        """Return E[Sym^order(H)] = sum_i p_i E[Sym^order(H_i)], p_i the probability of map i.
+
+        Sym^order(H) maps the monomials of (y, 1) of this degree to those of (z, 1).
+        """
         check_forgets("moments of a map", self)
         matrices = [affine.moments(order).matrix for affine in self.maps]
         probabilities = self.choice.probabilities
@@ -91,7 +97,7 @@ class Mixture(AbstractOneOfSeveralMaps, AbstractCombination):
         return by_corner
 
     def corner_count(self) -> int:
-        """Return the extreme weights times the product of the maps' counts."""
+        """Return the number of extreme laws of the choice, times that of combinations of extreme laws of the maps."""
         return len(self.choice.corners()) * super().corner_count()
 
     def covers_kind(self, actual: AbstractRandomAffine, same_noise: SameNoise) -> bool:
@@ -120,7 +126,8 @@ class Mixture(AbstractOneOfSeveralMaps, AbstractCombination):
 
     def in_words(self) -> str:
         """Return the maps in words with their shares; a choice between a map and noise alone is an unnoticed loss."""
-        maps_in_words, shares = [affine.in_words() or DIRECT for affine in self.maps], self.choice.probabilities
+        maps_in_words = [affine.in_words() or DIRECT for affine in self.maps]
+        shares = self.choice.probabilities
         if len(maps_in_words) == 2 and maps_in_words[1] == NOTHING_SENT:
             return f"{maps_in_words[0]}, {write_percentage(shares[1])} lost unnoticed"
         choices = (f"{words} ({write_percentage(p)})" for words, p in zip(maps_in_words, shares, strict=True))
@@ -140,12 +147,16 @@ class Mixture(AbstractOneOfSeveralMaps, AbstractCombination):
         return self.rebuilt(*visited), position
 
     def mean_gain(self) -> AbstractRandomAffine:
-        """Return the map z = E[G] y + n, where n is Gaussian with the mean and covariance of the mixture's noise."""
+        """Return the map z = E[G] y + n, for a filter that takes the mean gain as the true one.
+
+        The noise n is Gaussian with the mean and covariance of the mixture's noise, which is z at y = 0.
+        """
         moments = self.moments(2)
         mean = moments.mean
+        # Rows of the monomials z_i z_j in E[Sym^2(H)], at [i, j]; the last index, left out, is that of the constant 1.
         noise_products = product_table(self.outputs + 1, first=1, second=1)[:-1, :-1]
         second_moment = moments.matrix[noise_products, -1]  # E[n n'], the coefficients of the monomial 1
-        offset = mean[:-1, -1]
+        offset = mean[:-1, -1]  # E[n], last column of H = [[G, n], [0, 1]]
         square_of_mean = offset[:, None] * offset
         noise = Gaussian(second_moment - square_of_mean, offset)
         return GainAndNoise(Constant(1.0), mean[:-1, :-1], noise)

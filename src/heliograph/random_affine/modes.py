@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from functools import reduce
 from itertools import product
 from math import prod
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -33,7 +34,7 @@ from heliograph.random_affine.moments.monomials import JointMoments
 from heliograph.random_affine.moments.signal_path import ChannelPosition, Visit
 from heliograph.random_affine.noises.noise import AbstractNoise, Matrix, as_noise
 
-MODES = 1024  # joint modes that are listed: a filter's matrices have as many blocks in a row
+MODES = 1024  # most joint modes of all memories: a filter's matrices have as many blocks in a row
 
 
 class Modes(AbstractOneOfSeveralMaps, AbstractModal):
@@ -50,10 +51,11 @@ class Modes(AbstractOneOfSeveralMaps, AbstractModal):
     maps: tuple[AbstractRandomAffine, ...]
 
     def __init__(self, chain: MarkovChain, maps: Sequence[AbstractRandomAffine]):
-        """Hold the Markov chain and one memoryless map for each of its modes."""
+        """Hold the Markov chain and one map for each of its modes, all of one shape and without memory of their own."""
         if not isinstance(chain, MarkovChain):
             raise fail("chain", "a MarkovChain", show_value(chain))
-        self.memory, self.maps = chain, check_maps("maps of the modes", maps)
+        self.memory = chain
+        self.maps = check_maps("maps of the modes", maps)
         if len(self.maps) != chain.modes:
             raise fail("maps of the modes", f"{chain.modes}, one for each mode", len(self.maps))
         self.check_shapes("maps of the modes")
@@ -61,9 +63,9 @@ class Modes(AbstractOneOfSeveralMaps, AbstractModal):
             check_forgets("map of a mode", m)
 
     def given(self, state: int | float | jax.Array | np.ndarray) -> AbstractRandomAffine:
-        """Return the map of this mode.
+        """Return the map of the mode with the number `state`.
 
-        If JAX traces the mode and the maps differ only in numbers, it is one map with the chosen numbers. If they
+        If JAX traces the number and the maps differ only in numbers, it is one map with the chosen numbers. If they
         differ in structure, it is a map that holds all of them and chooses what they return.
         """
         if isinstance(state, int | np.integer):
@@ -84,22 +86,22 @@ class Modes(AbstractOneOfSeveralMaps, AbstractModal):
         return all(assumed_map.covers(actual_map, same_noise) for assumed_map, actual_map in pairs)
 
     def in_words(self) -> str:
-        """Return the maps in words, and the name of the memory."""
+        """Return a text such as "'state': modes (hop or nothing sent)", with the name of the memory and the maps."""
         return f"{self.memory_in_words}modes ({' or '.join(affine.in_words() or DIRECT for affine in self.maps)})"
 
 
 class _MapOfTracedIndex(AbstractOneOfSeveralMaps):
-    """The map of a traced index among several."""
+    """The map maps[index], for an index that JAX traces and maps that differ in structure."""
 
     maps: tuple[AbstractRandomAffine, ...]
     index: jax.Array
 
     def sample(self, key: jax.Array) -> jax.Array:
-        """Draw from the map of the index."""
+        """Draw H of every map, and return that of maps[index]."""
         return jnp.stack([m.sample(key) for m in self.maps])[self.index]
 
     def moments(self, order: int) -> JointMoments:
-        """Return the moments of the map of the index."""
+        """Return the moments of maps[index], by computing those of every map."""
         matrices = [jnp.asarray(m.moments(order).matrix) for m in self.maps]
         return JointMoments(jnp.stack(matrices)[self.index], self.outputs, self.inputs, order)
 
@@ -117,7 +119,7 @@ class ModeOutput(AbstractModal):
 
     @property
     def inputs(self) -> int:
-        """Length of y."""
+        """Length of y, none of which is in z."""
         return self.sent
 
     def carry_angles(self, sent: Angles) -> Angles:
@@ -134,7 +136,10 @@ class ModeOutput(AbstractModal):
 
 
 class OneStepLate(AbstractMapWrapper):
-    """Map of which each step receives what was drawn at the step before; NaN at the first."""
+    """Map z_k = G_(k-1) y_k + n_(k-1), with what `base` drew one step earlier; z_0 is NaN.
+
+    It delivers side information, such as a mode's number, that is known one step late.
+    """
 
     base: AbstractRandomAffine
 
@@ -167,7 +172,10 @@ class OneStepLate(AbstractMapWrapper):
         return self.base.carry_angles(sent)
 
     def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
-        """Return the map with visit(name, hop, signal) in place of each hop of `base`, and the position behind it."""
+        """Return the map with visit(name, hop, signal) in place of each hop of `base`, and the position behind it.
+
+        A hop is a transmitter with its link. `position` has the name and number of the next one, and the signal there.
+        """
         base, position = self.base.visit_hops(visit, position)
         return self.rebuilt(base), position
 
@@ -209,21 +217,22 @@ class Faded(AbstractHop, AbstractModal):
         self.noise = as_noise("channel noise", noise, self.matrix.shape[0])
 
     def in_words(self) -> str:
-        """Return what it is, and the name of the memory."""
+        """Return a text such as "'fading': drifting hop", with the name of the memory if it has one."""
         return f"{self.memory_in_words}drifting hop"
 
     def given(self, state: int | float | jax.Array | np.ndarray) -> GainAndNoise:
-        """Return the map with the gain mean + deviation c."""
+        """Return the hop z = (mean + deviation c) A y + n, where c is the `state` of the memory."""
         drift = self.deviation * state
         gain = self.mean + drift
         return GainAndNoise(Constant(gain), self.matrix, self.noise)
 
 
 class JointModes(Module):
-    """Map as one chain and one map without memory for each of its modes.
+    """A channel with memories as one Markov chain (its joint modes), and one map without memory for each mode.
 
-    Where a fading drifts, its modes are the nodes of `AbstractMemory.nodes`: expectations are right, and `initial` and
-    `transition` need not be probabilities. A map without memory has one mode.
+    A mode is a combination of one state of each memory. For a drifting fading these states are the quadrature nodes of
+    `AbstractMemory.nodes`: expectations are right, but `initial` and `transition` may be negative, and then are no
+    probabilities. A channel without memory has one mode.
 
     Args:
         initial: law of the mode at the first step (modes,).
@@ -240,17 +249,17 @@ class JointModes(Module):
     beside: tuple[PyTree, ...]
 
     def moments(self, order: int) -> Float[jax.Array | np.ndarray, "modes rows columns"]:
-        """Return E[Sym^order(H) | mode] of each mode; times transition[i, j], it is block (j, i) of joint moments."""
+        """Return E[Sym^order(H) | mode j] at [j]; block (j, i) of the joint moments is transition[i, j] times it."""
         return stack_parts([m.moments(order).matrix for m in self.maps])
 
 
 def joint_modes(
     channel: AbstractRandomAffine, nodes: int | None = None, order: int = 1, beside: PyTree = ()
 ) -> JointModes:
-    """Combine the memories of a channel in one chain, the first slowest, with the map given each joint mode.
+    """Combine the memories of a channel in one Markov chain, and return it with the channel's map in each joint mode.
 
-    The transition is Pi_a x Pi_b (Kronecker). f(a, b) of maps with chains of their own is f(a_i, b_j) in mode (i, j);
-    of maps that share one, f(a_i, b_i).
+    A joint mode is one state of each memory; that of the first memory varies slowest. Independent chains with the
+    transitions Pi_a and Pi_b have together the Kronecker product Pi_a x Pi_b. Maps that share a memory share its state.
 
     Args:
         channel: any map.
@@ -274,12 +283,7 @@ def joint_modes(
     total = prod(len(chain.initial) for chain in chains)
     if total > MODES:
         raise fail("memories of a channel", f"at most {MODES:,} modes together", f"{total:,}")
-    xp = library(chains)
-    # Independent memories: their laws multiply.
-    initial = reduce(xp.kron, [chain.initial for chain in chains], np.ones(1))
-    transition = reduce(xp.kron, [chain.transition for chain in chains], np.ones((1, 1)))
-    # The largest that each joint transition may be: the product of the largest ones.
-    largest = reduce(xp.kron, [chain.transition + chain.radius for chain in chains], np.ones((1, 1)))
+    joint = _combine_independent_chains(chains)
     # The state of each memory in each joint mode, and the maps given these.
     states_by_mode = [
         dict(zip(by_identity, [state.item() for state in states], strict=True))
@@ -289,12 +293,28 @@ def joint_modes(
     for m in maps:
         check_forgets("channel of a filter", m)
     return JointModes(
-        initial=initial,
-        transition=transition,
-        radius=largest - transition,
+        *joint,  # initial, transition, radius
         maps=maps,
         beside=tuple(condition_on_states(beside, states) for states in states_by_mode),
     )
+
+
+class _JointChain(NamedTuple):
+    """Initial law, transition and its radius of uncertainty of several chains together."""
+
+    initial: Law
+    transition: Rows
+    radius: Rows
+
+
+def _combine_independent_chains(chains: Sequence[MemoryStates]) -> _JointChain:
+    """Return the chain of all combinations of one state of each independent chain: probabilities are multiplied."""
+    xp = library(chains)
+    initial = reduce(xp.kron, [chain.initial for chain in chains], np.ones(1))
+    transition = reduce(xp.kron, [chain.transition for chain in chains], np.ones((1, 1)))
+    # Upper end of each joint transition probability: the product of the upper ends.
+    largest = reduce(xp.kron, [chain.transition + chain.radius for chain in chains], np.ones((1, 1)))
+    return _JointChain(initial, transition, largest - transition)
 
 
 def _represent_memory_by_nodes(memory: AbstractMemory, degree: int, nodes: int | None) -> MemoryStates:
@@ -309,7 +329,7 @@ def _represent_memory_by_nodes(memory: AbstractMemory, degree: int, nodes: int |
 
 
 ROUNDING = 1e-12  # relative: of sums over modes that cancel
-DOUBLINGS = 60  # of the steps after which the law of the modes is that of the long run
+DOUBLINGS = 60  # 2^60 steps, after which the law of the modes is that of the long run
 
 
 def redraw_modes_each_step(channel: AbstractRandomAffine) -> AbstractRandomAffine:
@@ -323,9 +343,11 @@ def redraw_modes_each_step(channel: AbstractRandomAffine) -> AbstractRandomAffin
 
 
 def mix_maps_of_modes(modes: JointModes, law: np.ndarray | None = None) -> AbstractRandomAffine:
-    """Return one of the modes' maps, by a law (that of the long run unless given)."""
-    in_the_long_run = long_run_law(np.asarray(modes.initial), np.asarray(modes.transition))
-    return Mixture(modes.maps, in_the_long_run / in_the_long_run.sum() if law is None else law)
+    """Return the mixture that is the map of mode i with probability law[i]; by default the chain's long-run law."""
+    if law is None:
+        in_the_long_run = long_run_law(np.asarray(modes.initial), np.asarray(modes.transition))
+        law = in_the_long_run / in_the_long_run.sum()
+    return Mixture(modes.maps, law)
 
 
 def long_run_law(initial: Float[np.ndarray, " modes"], chain: Float[np.ndarray, "modes modes"]) -> np.ndarray:
@@ -342,7 +364,7 @@ def long_run_law(initial: Float[np.ndarray, " modes"], chain: Float[np.ndarray, 
 
 
 def mode_laws_over_time(steps: Sequence[JointModes]) -> list[np.ndarray]:
-    """Return the probabilities of the modes at each step, from the first law and each step's transitions."""
+    """Return the probabilities (modes,) of the modes at each step: p_(k+1) = p_k Pi_k with the transitions Pi_k."""
     laws = [np.asarray(steps[0].initial)]
     for step in steps[:-1]:
         laws.append(laws[-1] @ np.asarray(step.transition))

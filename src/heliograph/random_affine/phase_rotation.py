@@ -13,7 +13,7 @@ from heliograph.random_affine.hop import known
 from heliograph.random_affine.moments.monomials import JointMoments, list_exponents, symmetric_power
 from heliograph.random_affine.moments.signal_path import ChannelPosition, Visit
 
-# (a, b, 1) to (w, its conjugate, 1) with w = a + i b.
+# Matrix that takes (a, b, 1) to (w, v, 1) with w = a + i b and its conjugate v = a - i b.
 TO_COMPLEX = np.array([[1, 1j, 0], [1, -1j, 0], [0, 0, 1]])
 
 
@@ -57,8 +57,9 @@ class Rotation(AbstractRandomAffine):
     def moments(self, order: int) -> JointMoments:
         """Return E[Sym^k(H)] = Sym^k(C)^-1 diag(exp(-(p - q)^2 deviation^2 / 2)) Sym^k(C), k = `order`.
 
-        C takes (y_1, y_2) to w = y_1 + i y_2 and its conjugate v. A turn by phi multiplies w^p v^q by
-        exp(i (p - q) phi), whose mean is the factor on the diagonal.
+        Sym^k(H) maps the monomials of (y, 1) of degree k to those of (z, 1). C takes (y_1, y_2) to w = y_1 + i y_2 and
+        its conjugate v. A turn by phi multiplies w^p v^q by exp(i (p - q) phi), whose mean is the factor on the
+        diagonal.
         """
         turns = np.array([p - q for p, q, _ in list_exponents(3, order)])
         factors = library(self.deviation).exp(-(turns**2) * self.deviation**2 / 2)
@@ -68,9 +69,9 @@ class Rotation(AbstractRandomAffine):
         return JointMoments(matrix.real, outputs=2, inputs=2, order=order)
 
     def visit_hops(self, visit: Visit, position: ChannelPosition) -> tuple[AbstractRandomAffine, ChannelPosition]:
-        """Return the map as it is, and the place as it was: it has no transmitter."""
+        """Return the map and the position unchanged: a rotation has no transmitter."""
         return self, position
 
     def mean_gain(self) -> AbstractRandomAffine:
-        """Return the map exp(-deviation^2 / 2) y."""
+        """Return the map z = exp(-deviation^2 / 2) y of the mean gain E[H]."""
         return known(self.moments(1).mean[:-1, :-1])

@@ -73,7 +73,10 @@ class RelayStorage(AbstractMapWrapper):
 
 
 class RelayedLinks(AbstractDelayLine):
-    """Links in series, each but the first with a random delay of what the one before delivered."""
+    """Links in series whose relays store signals: each stage but the first delays, at random, what the one before sent.
+
+    stages: the links, first that of the sensor.
+    """
 
     stages: tuple[AbstractRandomAffine, ...]
 
@@ -88,7 +91,8 @@ class RelayedLinks(AbstractDelayLine):
 
         A stage that delays takes past outputs of the stage before it, stored for stage.past steps.
         """
-        size, line_map = signal_size(self.stages[0]), place_on_delay_line(self.stages[0])
+        size = signal_size(self.stages[0])
+        line_map = place_on_delay_line(self.stages[0])
         for stage in self.stages[1:]:
             line_map = Series([RelayStorage(line_map, size, stage.past), place_on_delay_line(stage)])
         return line_map
@@ -99,7 +103,7 @@ class RelayedLinks(AbstractDelayLine):
 
     @property
     def past(self) -> int:
-        """The longest delay of all together."""
+        """Longest possible delay from the first link to the last, in steps: the sum of the stages' longest delays."""
         return sum(stage.past for stage in self.stages)
 
 

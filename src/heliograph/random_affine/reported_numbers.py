@@ -17,7 +17,7 @@ class AbstractFreshDraw(AbstractMemory):
     """Numbers that are drawn independently at each step, and reported to the receiver with each message."""
 
     def move(self, state: jax.Array, key: jax.Array) -> jax.Array:
-        """Draw the next state, whatever the last one was."""
+        """Draw the next state by the law of the first one: it does not depend on the last `state`."""
         return self.begin(key)
 
     def nodes(self, degree: int) -> MemoryStates:
@@ -31,7 +31,7 @@ class AbstractFreshDraw(AbstractMemory):
 
 
 class FreshNumbers(AbstractFreshDraw):
-    """Numbers that are drawn anew at each step; a receiver is told all of them.
+    """Numbers that are drawn anew at each step, all of which each message reports to the receiver.
 
     Args:
         law: law of the numbers, of a gain for one of them; None where nobody knows it, and nothing can be simulated.
@@ -90,5 +90,6 @@ class FreshReading(AbstractFreshDraw):
     def begin(self, key: jax.Array) -> jax.Array:
         """Draw (g, a) (2,), a gain g and its reading a = g + e, where the error e has the variance `variance`."""
         gain_key, error_key = jax.random.split(key)
-        gain, error = self.law.sample(gain_key), jax.random.normal(error_key, dtype=float)
+        gain = self.law.sample(gain_key)
+        error = jax.random.normal(error_key, dtype=float)
         return jnp.stack([gain, gain + jnp.sqrt(self.variance) * error])

@@ -57,7 +57,7 @@ class AbstractCombination(AbstractComposite):
         return self.maps[0].inputs
 
     def _init(self, key: jax.Array) -> PyTree[jax.Array]:
-        """Return the tuple of the maps' initial states; () if all maps forget, so that their draws are independent."""
+        """Return the tuple of the maps' initial states; () if the draws of all are independent over time."""
         keys = jax.random.split(key, len(self.maps))
         return tuple(m.init(k) for m, k in zip(self.maps, keys, strict=True)) if self.remembers else ()
 
@@ -81,7 +81,7 @@ class AbstractCombination(AbstractComposite):
     ) -> tuple[PyTree[jax.Array], list[jax.Array]]:
         """Draw each map by its key; return the next state, and the drawn H of each map.
 
-        The state is the tuple of the maps' states, or () if all maps forget.
+        The state is the tuple of the maps' states, or () if the draws of all maps are independent over time.
         """
         states = state if self.remembers else ((),) * len(self.maps)
         draws = [affine.draw(map_state, key) for affine, map_state, key in zip(self.maps, states, keys, strict=True)]
@@ -209,8 +209,10 @@ class Series(AbstractCombination):
         """Return the series with visit(name, hop, signal) in place of each hop, and the position behind it.
 
         Each map is visited with the second moment of the signal that reaches it, or None if it is not known.
+        A hop is a transmitter with its link. `position` has the name and number of the next one, and the signal there.
         """
-        visited, signal = list[AbstractRandomAffine](), position.signal
+        visited = list[AbstractRandomAffine]()
+        signal = position.signal
         for i, affine in enumerate(self.maps):
             changed, position = affine.visit_hops(visit, position._replace(signal=signal))
             visited.append(changed)
@@ -233,11 +235,11 @@ def _join_outcomes_in_series(x: ArrivalOutcome, y: ArrivalOutcome) -> tuple[Abst
 
 
 def _compose_draws(second: jax.Array, first: jax.Array) -> jax.Array:
-    """Return the product of two drawn maps, second after first, with rows of NaN for lost outputs.
+    """Return the product of two drawn H = [[G, n], [0, 1]], second after first, with rows of NaN for lost outputs.
 
     An output of the second map is lost too if it has a gain on a lost output of the first.
     """
-    is_lost = jnp.isnan(first).any(axis=1)
+    is_lost = jnp.isnan(first).any(axis=1)  # which outputs of the first map are lost
     is_lost_after = jnp.any((second != 0) & is_lost, axis=1) | jnp.isnan(second).any(axis=1)
     return jnp.where(is_lost_after[:, None], jnp.nan, second @ jnp.where(is_lost[:, None], 0.0, first))
 
@@ -350,6 +352,7 @@ class Stack(AbstractCombination):
         """Return the stack with visit(name, hop, signal) in place of each hop, and the position unchanged.
 
         Names of the hops in a map begin with "part" and its number. Hops side by side do not lengthen the chain.
+        A hop is a transmitter with its link. `position` has the name and number of the next one, and the signal there.
         """
         maps_and_positions = position.number_maps(self.maps, "part")
         visited = [affine.visit_hops(visit, position_of_map)[0] for affine, position_of_map in maps_and_positions]

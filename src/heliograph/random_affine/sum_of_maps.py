@@ -31,7 +31,7 @@ from heliograph.random_affine.moments.signal_path import ChannelPosition, Visit
 from heliograph.random_affine.noises.noise import AbstractNoise, Gaussian, Matrix, as_noise, noise_moment_vector
 from heliograph.random_affine.series_and_stack import AbstractCombination, Corners, Series, Stack
 
-Places = tuple[int, ...]  # of what a map takes, among the components of y
+Places = tuple[int, ...]  # indices of the components of y that a map takes
 
 
 class Superposed(AbstractCombination):
@@ -59,7 +59,8 @@ class Superposed(AbstractCombination):
         self, maps: Sequence[AbstractRandomAffine], noise: AbstractNoise, places: Sequence[Places], inputs: int
     ):
         """Hold the maps, the law of the noise n, and for each map the indices in y of its inputs (`places`)."""
-        self.maps, self.taken = check_maps("sum", maps), check_count("inputs of a sum", inputs)
+        self.maps = check_maps("sum", maps)
+        self.taken = check_count("inputs of a sum", inputs)
         self.noise = instance("noise of a sum", noise, AbstractNoise, "a law of a noise vector")
         self.places = tuple(
             tuple(check_count("place in the input of a sum", i, 0) for i in items("places of a map", chosen, "places"))
@@ -79,7 +80,7 @@ class Superposed(AbstractCombination):
 
     @property
     def inputs(self) -> int:
-        """Length of y."""
+        """Length of the whole y, of which each map takes some components."""
         return self.taken
 
     @property
@@ -125,7 +126,11 @@ class Superposed(AbstractCombination):
         return total.transpose(*range(1, total.ndim), 0).reshape(*values.shape[:-1], *(size,) * axes)
 
     def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
-        """Draw each map and the noise; return the next state, and H = [[G, n], [0, 1]] of the sum on all of y."""
+        """Draw each map and the noise; return the next state, and H = [[G, n], [0, 1]] of the sum on all of y.
+
+        G has the gain of each map in the columns of the components of y that it takes; n adds up the maps' noises and
+        the sum's own.
+        """
         keys = jax.random.split(key, len(self.maps) + 1)
         map_keys, noise_key = keys[:-1], keys[-1]
         state, matrices = self._draw_each(state, map_keys)
@@ -145,11 +150,17 @@ class Superposed(AbstractCombination):
 
     @cache_by_object
     def corner_moments(self, order: int) -> Corners:
-        """Return E[Sym^order(H)] for each combination of one extreme law ("corner") of each map."""
+        """Return E[Sym^order(H)] for each combination of one extreme law ("corner") of each map.
+
+        Sym^order(H) maps the monomials of (y, 1) of this degree to those of (z, 1).
+        """
         return self._add_moments([m.corner_moments(order) for m in self.maps], order)
 
     def _interval_of_parts(self, order: int) -> Interval:
-        """Return an interval of each entry of E[Sym^order(H)], from those of the equal map [I ... I] after a stack."""
+        """Return an interval of each entry of E[Sym^order(H)], found for the equal map: a sum [I ... I] after a stack.
+
+        Sym^order(H) maps the monomials of (y, 1) of this degree to those of (z, 1).
+        """
         return self.as_stack.moment_interval(order)
 
     def covers_kind(self, actual: AbstractRandomAffine, same_noise: SameNoise) -> bool:
@@ -198,6 +209,8 @@ class Superposed(AbstractCombination):
 
         Each map is a link that takes some components of y, and names of its hops begin with "link" and its number.
         Links side by side are not hops of the chain, so that the position does not change.
+
+        A hop is a transmitter with its link. `position` has the name and number of the next one, and the signal there.
         """
         maps_and_positions = zip(position.number_maps(self.maps, "link"), self.places, strict=True)
         visited = [
@@ -249,7 +262,7 @@ def move_sensor_into_links(
 
 
 class _MapsWithMemories(NamedTuple):
-    """Some maps of a sum, by their numbers, and the identities of all memories inside them."""
+    """A group of maps of a sum. memories: identities of all memories inside them. maps: the maps' numbers."""
 
     memories: set[str]
     maps: list[int]
@@ -267,10 +280,15 @@ def split_terms_without_common_memory(channel: AbstractRandomAffine) -> list[Abs
     # Map after map: the groups that share a memory with it are joined, and so are groups without any memory.
     groups: list[_MapsWithMemories] = []
     for i, affine in enumerate(channel.maps):
-        identities, numbers = set(memories(affine)), [i]  # names of its memories; numbers of the maps in the group
-        for group in [group for group in groups if group.memories & identities or not (group.memories or identities)]:
-            groups.remove(group)
-            identities, numbers = identities | group.memories, group.maps + numbers
+        identities = set(memories(affine))  # of its memories
+        numbers = [i]  # of the maps in the new group
+        for group in list(groups):
+            share_memory = bool(group.memories & identities)
+            both_without_memory = not (group.memories or identities)
+            if share_memory or both_without_memory:
+                groups.remove(group)
+                identities = identities | group.memories
+                numbers = group.maps + numbers
         groups.append(_MapsWithMemories(identities, numbers))
     no_noise = as_noise("noise of a term", 0.0, channel.outputs)
     return [

@@ -23,15 +23,15 @@ T = TypeVar("T")
 
 
 def believe_untold(channel: T) -> T:
-    """Return the law of the channel before a message, which is not conditioned on the numbers that it will report.
+    """Return the channel as it is for a receiver that has not got the message yet: reported numbers count as random.
 
-    A told map, `AbstractToldMap`, is a map of which each message reports numbers, such as its gain. It is replaced by
-    its law with random numbers. If their law is not known, or that map is of no known kind, it is replaced by the map
-    of an example of the numbers (`typical`).
+    A link may report numbers with each message, such as its gain ("told" numbers). A filter conditions on them, but a
+    prediction of z before the message cannot. So each part z = G y + n of the channel with such numbers is replaced by
+    its law averaged over them. Where their law is not known, the part gets example numbers (`typical`) instead.
     """
 
     def average(leaf: object) -> object:
-        """Return a told map with random or example numbers; return anything else unchanged."""
+        """Return a map with reported numbers as its averaged law, or with example numbers; all else unchanged."""
         if not isinstance(leaf, AbstractToldMap):
             return leaf
         law_before_message = _find_law_before_message(leaf)

@@ -53,7 +53,7 @@ from heliograph.model.trigger import AbstractThreshold
 from heliograph.numerics.types import Array, ArrayLike, Float
 
 RIM = 1e-9  # share of delta by which a value may lie inside for rounding
-COUNTED = 16  # lost transmissions that are counted; more are as many
+COUNTED = 16  # counts 0 to 15 of lost transmissions; the last one stands for all larger ones
 
 
 class Message(NamedTuple):
@@ -108,13 +108,13 @@ class EventFilter(AbstractSizedFilter):
 
     @property
     def senders(self) -> list[slice]:
-        """Components of y that are sent together."""
+        """For each sender the slice of y that it sends: a component each if the rule is for each, else all of y."""
         m = self.outputs
         return [slice(i, i + 1) for i in range(m)] if self.trigger.region == "each" else [slice(0, m)]
 
     @property
     def silence_tells(self) -> bool:
-        """Always true: silence is a measurement."""
+        """Always True: a sender is silent only if |y - r| <= delta, so that silence is a measurement."""
         return True
 
     @compile_on_call
@@ -303,15 +303,12 @@ class EventFilter(AbstractSizedFilter):
     ) -> tuple[GaussianSum, jax.Array, jax.Array]:
         """Return the sum over (x, r) given a value z of a sender, and the predicted mean and covariance of z.
 
-        Each Gaussian of `xry`, over (x, r, y), gets a Kalman update, is cut to where the sender sends, and all are
-        merged.
+        Each Gaussian of `xry`, over (x, r, y), gets a Kalman update and is cut to |y - r| > delta; all are merged.
         """
         s, z, losses = message.sender, message.value, message.losses
-        # Status probabilities (K, M, A, C), by link mode, steps since sent and losses, times P(z's pattern | mode).
         sender, arrived = self.senders[s], ~jnp.isnan(z)
-        pattern = arrived if len(self.senders) == 1 else jnp.ones(self.outputs, dtype=bool)
-        pattern_number = pattern_of(channel, pattern) if len(channel.present) > 1 else 0
-        chance = jnp.asarray(channel.chance)[:, pattern_number]
+        # Status probabilities (K, M, A, C), by link mode, steps since sent and losses, times P(z's pattern | mode).
+        pattern_number, chance = self._find_arrival_pattern(channel, arrived)
         arrival_probability = chance if len(self.senders) == 1 else 1 - self._loss_probability(channel, s)
         status = xry.status[:, s] * arrival_probability[:, None, None]
         if self.trigger.losses == "numbered":  # the sender's counter says how many were lost before
@@ -321,7 +318,7 @@ class EventFilter(AbstractSizedFilter):
         for j in range(1 if self.same_law_in_modes else status.shape[1]):
             status_of_mode = status if self.same_law_in_modes else jnp.zeros_like(status).at[:, j].set(status[:, j])
             mode = jnp.argmax(chance > 0) if self.same_law_in_modes else j
-            moments = channel.mean, channel.gain_covariance, channel.noise
+            moments = channel.mean, channel.gain_covariance, channel.noise  # each array by (mode, pattern)
             links.append(
                 LinkMoments(*jax.tree.map(lambda part, at=(mode, pattern_number): jnp.asarray(part)[at], moments))
             )
@@ -329,17 +326,31 @@ class EventFilter(AbstractSizedFilter):
             updated.append(
                 condition_parts_on_received(prior[j], z, arrived, links[j], sender, self.outputs, self.delivers_signal)
             )
-        # Cut to where the sender sends: several times the blocks [updated, prior], each by mode. Sorted by mode again.
-        count, size = len(links), len(status)
-        sent = self._restrict_to_sent(concatenate_sums([*updated, *prior]), message)
-        blocks = [sent.select_range(start, start + size) for start in range(0, len(sent.log_weight), size)]
-        sorted_blocks = [concatenate_sums(blocks[j :: 2 * count]) for j in range(2 * count)]
-        sent_updated, sent_prior = sorted_blocks[:count], sorted_blocks[count:]
+        sent_updated, sent_prior = self._restrict_each_to_sent(updated, prior, message)
         # All merged to one Gaussian of (x, y), since y is the next reference.
         merged = merge_groups(concatenate_sums(sent_updated).select_components(self._find_new_reference(sender)))
         merged = merged.with_sender_status(s, status_after_sending(merged.status[:, s], is_lost=False))
         predicted_z = predict_sent_value(sent_prior, links, sender, self.outputs)
         return self._pad_sum(merged), predicted_z.mean[0], predicted_z.covariance[0]
+
+    def _find_arrival_pattern(self, channel: ChannelByPattern, arrived: jax.Array) -> tuple[jax.Array | int, jax.Array]:
+        """Return the number of the pattern of arrivals `arrived`, and its probability in each mode (M,)."""
+        pattern = arrived if len(self.senders) == 1 else jnp.ones(self.outputs, dtype=bool)
+        number = pattern_of(channel, pattern) if len(channel.present) > 1 else 0
+        return number, jnp.asarray(channel.chance)[:, number]
+
+    def _restrict_each_to_sent(
+        self, updated: list[GaussianSum], prior: list[GaussianSum], message: Message
+    ) -> tuple[list[GaussianSum], list[GaussianSum]]:
+        """Return the sums after (`updated`) and before a value, one for each mode, each cut to where the sender sends.
+
+        All are cut at once, which gives several groups of all Gaussians. Their parts are joined again for each sum.
+        """
+        count, size = len(prior), len(prior[0].log_weight)
+        sent = self._restrict_to_sent(concatenate_sums([*updated, *prior]), message)
+        blocks = [sent.select_range(start, start + size) for start in range(0, len(sent.log_weight), size)]
+        by_sum = [concatenate_sums(blocks[j :: 2 * count]) for j in range(2 * count)]
+        return by_sum[:count], by_sum[count:]
 
     def _restrict_to_sent(self, xry: GaussianSum, message: Message) -> GaussianSum:
         """Restrict each Gaussian of (x, r, y) to where the sender sends: |y - r| > delta, or anywhere if it must send.
@@ -374,7 +385,7 @@ class EventFilter(AbstractSizedFilter):
 
     @estimates
     def estimate(self, state: EventBelief) -> Estimate:
-        """Return the mean and covariance of the whole sum."""
+        """Return mean and covariance of the plant's state under the whole sum of Gaussians."""
         merged = self._merge_state(state)
         return Estimate(merged.mean, merged.covariance, self.claim)
 

@@ -155,7 +155,8 @@ def _gain_and_noise_covariance(channel: ChannelByPattern) -> np.ndarray:
     A known gain has covariance 0, but E[G G'] - M M' with M = E G is computed as some eps of |M M'|. `squared_gain`
     holds |M M'|, with a last row and column of zeros for n.
     """
-    gain, covariance = np.asarray(channel.mean)[..., :-1], np.asarray(channel.covariance)
+    gain = np.asarray(channel.mean)[..., :-1]
+    covariance = np.asarray(channel.covariance)
     size = np.abs(gain)
     squared_gain = size[..., :, None, :, None] * size[..., None, :, None, :]
     leading_axes = squared_gain.ndim - 2
@@ -178,7 +179,8 @@ def _arrival_determines_y(channel: ChannelByPattern) -> bool:
     # The pairs (mode, pattern of arrivals) that can occur and in which something arrives.
     possible = [(j, a) for j, a in np.argwhere(np.asarray(channel.chance) > 0) if channel.present[a].any()]
     for j, a in possible:
-        gain, arrives = np.asarray(channel.mean)[j, a, :, :-1], np.asarray(channel.present)[a]
+        gain = np.asarray(channel.mean)[j, a, :, :-1]
+        arrives = np.asarray(channel.present)[a]
         # Rows are scaled to 1, so that the rank does not depend on units.
         row_size = np.abs(gain).max(axis=1, keepdims=True)
         scaled_gain = gain / np.where(row_size > 0, row_size, 1.0)
@@ -189,7 +191,11 @@ def _arrival_determines_y(channel: ChannelByPattern) -> bool:
 
 
 def _has_same_law_in_every_mode(channel: ChannelByPattern) -> bool:
-    """Return whether what arrives has the same mean and covariance in every mode in which it can arrive."""
+    """Return whether what arrives has the same mean and covariance in every mode in which it can arrive.
+
+    This must hold for each pattern of arrivals (which components come). Then a value needs one update, not one for each
+    mode of the link.
+    """
     possible = np.asarray(channel.chance) > 0  # (mode, pattern of arrivals)
     for a, modes in enumerate(possible.T):
         if not channel.present[a].any() or not modes.any():
@@ -223,7 +229,19 @@ def _delivers_y_unchanged(channel: ChannelByPattern) -> bool:
 def _check_threshold_rule(
     rule: AbstractTrigger, lost: int | None, outputs: int, received: int, steps: list[ChannelByPattern]
 ) -> AbstractThreshold:
-    """Return the sending rule; raise ValueError where the Gaussian sum has no form for its region or its losses."""
+    """Return the sending rule, if the filter's sum of Gaussians has a form for its region and its losses.
+
+    Args:
+        rule: the sending rule.
+        lost: number of Gaussians for a reference that was lost; None if nothing is lost.
+        outputs: length of the signal y.
+        received: length of what arrives.
+        steps: the law of what arrives, at each step.
+
+    Raises:
+        ValueError: no threshold rule; losses of a reference that is the value sent last without a Gaussian for them; a
+            ball of too many components; components that are sent each alone, but not over links of their own.
+    """
     trigger = instance("trigger", rule, AbstractThreshold, "SendOnDelta, SendOnPredictionError or another of these")
     if lost == 0 and trigger.reference == "sent":
         raise fail("lost", "at least 1, since transmissions may be lost", lost)
@@ -248,7 +266,8 @@ def _has_independent_losses(channel: ChannelByPattern) -> bool:
     The probability of each pattern of arrivals is then the product of the probabilities of its components.
     `channel.mean` is E[(G, n)] of z = G y + n.
     """
-    m, chance = channel.mean.shape[-2], np.asarray(channel.chance)
+    m = channel.mean.shape[-2]
+    chance = np.asarray(channel.chance)
     if len(chance) > 1:
         return False
     arrival_probability = chance[0] @ np.asarray(channel.present)

@@ -20,7 +20,7 @@ NODES = NODES + 0.5  # on (0, 1)
 
 
 class BallMoments(NamedTuple):
-    """log P(e in the region), and mean (m,) and covariance (m, m) of e there."""
+    """Moments of a Gaussian vector e in a region: log_mass is log P(e in it); mean (m,) and covariance (m, m) there."""
 
     log_mass: jax.Array
     mean: jax.Array
@@ -117,7 +117,8 @@ def truncate_to_ball(mixture: GaussianSum, directions: jax.Array, radius: jax.Ar
         variance, eigenvectors = eigh(WeightedColumns(slopes, x.variances).covariance)
         # Components without variance, up to rounding, stay where they are.
         least = CERTAIN**0.5 * (radius**2 + jnp.sum(centre**2))
-        slopes, centre = eigenvectors.T @ slopes, eigenvectors.T @ centre
+        slopes = eigenvectors.T @ slopes
+        centre = eigenvectors.T @ centre
         variance_or_least = jnp.maximum(variance, least)
         # Log probability of the region, E e and Cov e in it. `varies`: components to be changed, of a possible region.
         moments = ball_moments(centre, variance_or_least, radius, inside)
@@ -142,7 +143,8 @@ def _truncate_component(centre: jax.Array, variance: jax.Array, radius: jax.Arra
     deviation = jnp.sqrt(variance)
     edge = jnp.array([-1.0, 1.0]) * radius
     if inside:
-        low, high = (edge[:1] - centre) / deviation, (edge[1:] - centre) / deviation
+        low = (edge[:1] - centre) / deviation
+        high = (edge[1:] - centre) / deviation
         sign, moments = jnp.ones(1), truncated_normal(low, high)
     else:
         sign = jnp.array([-1.0, 1.0])
@@ -155,7 +157,10 @@ def _truncate_component(centre: jax.Array, variance: jax.Array, radius: jax.Arra
 
 
 def _join_pieces(pieces: BallMoments) -> BallMoments:
-    """Return the log of the whole mass, and the moments of the mixture of pieces (piece, ...) by their masses."""
+    """Return the moments of the union of disjoint regions, `pieces` (piece, ...), from those of each.
+
+    The masses add up. Mean and covariance are those of the mixture of the pieces, weighted by their masses.
+    """
     # Masses are divided by the largest one. If all are 0, the pieces get equal shares.
     largest = jnp.max(pieces.log_mass)
     largest = jnp.where(jnp.isfinite(largest), largest, 0.0)

@@ -20,7 +20,7 @@ from heliograph.filters.truncation import truncate_gaussians
 from heliograph.numerics.trace_settings import trace_settings
 from heliograph.numerics.types import Array, Float
 
-FLOOR = 1e-6  # probability of what the rule forbids
+FLOOR = 1e-6  # least probability of data that contradict the sender's rule
 
 
 class GaussianSum(NamedTuple):
@@ -46,29 +46,29 @@ class GaussianSum(NamedTuple):
         return self._replace(log_weight=self.log_weight + safe_log(total), status=self.status.at[:, s].set(normalised))
 
     def scale_weights(self, log_factor: Array | float) -> "GaussianSum":
-        """Multiply all weights by exp(log_factor)."""
+        """Return the sum with all weights multiplied by exp(log_factor)."""
         return self._replace(log_weight=self.log_weight + log_factor)
 
     def select_range(self, first: int, stop: int | None = None) -> "GaussianSum":
-        """Take the Gaussians first, ..., stop - 1."""
+        """Return the sum of the Gaussians first, ..., stop - 1 alone; their weights stay."""
         few: GaussianSum = jax.tree.map(lambda leaf: leaf[first:stop], self)
         return few
 
     def select_components(self, indices: np.ndarray) -> "GaussianSum":
-        """Select components of the Gaussians' vector, in the order of `indices`."""
+        """Return the sum of the marginal laws of some components, in the order of `indices`."""
         # The first components alone need no new factorisation.
         if np.array_equal(indices, np.arange(len(indices))):
             return self._replace(gaussian=take_leading(self.gaussian, len(indices)))
 
         def select(x: Gaussian) -> Gaussian:
-            """Select components of one Gaussian."""
+            """Return the marginal law of these components under one Gaussian."""
             return from_columns(x.mean[indices], WeightedColumns(x.root[indices], x.variances))
 
         return self._replace(gaussian=jax.vmap(select)(self.gaussian))
 
 
 def safe_log(x: jax.Array) -> jax.Array:
-    """Return log x, -inf at 0 without a derivative that is no number."""
+    """Return log x; at x = 0 it is -inf, with the derivative 0 in place of NaN."""
     return jnp.where(x > 0, jnp.log(jnp.where(x > 0, x, 1.0)), -jnp.inf)
 
 
@@ -90,7 +90,11 @@ def concatenate_sums(sums: Sequence[GaussianSum]) -> GaussianSum:
 
 @jax.jit
 def truncate_between(mixture: GaussianSum, direction: jax.Array, lower: jax.Array, upper: jax.Array) -> GaussianSum:
-    """Truncate each Gaussian to lower <= d'x <= upper, (K,) or (), and take the Gaussian of the same moments."""
+    """Truncate each of K Gaussians x to lower <= d'x <= upper, and replace it by the Gaussian of the same moments.
+
+    d is `direction` (N,); the ends are numbers, or (K,) with one for each Gaussian. The weights are multiplied by the
+    probabilities of the interval.
+    """
     slopes, mean = _project_on_direction(mixture, direction)
     return _truncate(mixture, mean, slopes, [jnp.broadcast_to(end, mean.shape) for end in (lower, upper)])
 
@@ -104,7 +108,8 @@ def truncate_outside(mixture: GaussianSum, direction: jax.Array, edge: jax.Array
     slopes, mean = _project_on_direction(mixture, direction)
     # d'x <= -edge is (-d)'x >= edge, so mean and slopes change sign in the second half.
     edges = jnp.full(2 * len(mean), edge)
-    mean, slopes = jnp.concatenate([mean, -mean]), jnp.concatenate([slopes, -slopes])
+    mean = jnp.concatenate([mean, -mean])
+    slopes = jnp.concatenate([slopes, -slopes])
     return _truncate(concatenate_sums([mixture, mixture]), mean, slopes, [edges])
 
 
@@ -114,9 +119,10 @@ def _project_on_direction(mixture: GaussianSum, direction: jax.Array) -> tuple[j
 
 
 def _truncate(mixture: GaussianSum, mean: jax.Array, slopes: jax.Array, ends: Sequence[jax.Array]) -> GaussianSum:
-    """Truncate Gaussians to where d'x = mean + slopes xi is above the first end, and below the second if there is one.
+    """Truncate Gaussians x = m + L xi to where d'x is above the first end, and below the second if there is one.
 
-    Each weight is multiplied by the probability of that region.
+    d'x = mean + slopes xi, with `mean` (K,) and `slopes` (K, N). Each cut law is replaced by the Gaussian of the same
+    moments, and each weight is multiplied by the probability of the region.
     """
     log_mass, truncated = truncate_gaussians(mixture.gaussian, mean, slopes, ends)
     return GaussianSum(mixture.log_weight + log_mass, truncated, mixture.status)
@@ -189,14 +195,12 @@ def _merge_cheapest_pair(mixture: GaussianSum, ends: tuple[int, int], settings: 
     # Weights over the largest one, so that not all of them underflow; where all are 0 there is no largest one.
     top = jnp.max(mixture.log_weight)
     weight = jnp.exp(mixture.log_weight - jnp.where(jnp.isfinite(top), top, 0.0))
-    centre, variance = (
-        mixture.gaussian.mean[:, places],
-        jax.vmap(lambda x: x.columns.diagonal)(mixture.gaussian)[:, places],
-    )
+    mean = mixture.gaussian.mean[:, places]
+    variance = jax.vmap(lambda x: x.columns.diagonal)(mixture.gaussian)[:, places]
     # Cost of each pair, and the pair of least cost. A pair of no variance or no weight is divided by 1, not by 0.
     w1, w2 = weight[first], weight[second]
     both = variance[first] + variance[second]
-    apart = (centre[first] - centre[second]) ** 2 / jnp.where(both > 0, both, 1.0)
+    apart = (mean[first] - mean[second]) ** 2 / jnp.where(both > 0, both, 1.0)
     cost = w1 * w2 / jnp.where(w1 + w2 > 0, w1 + w2, 1.0) * jnp.sum(apart, axis=1)
     least = jnp.argmin(cost)
     chosen = jnp.arange(len(pairs)) == least

@@ -27,7 +27,11 @@ from heliograph.numerics.linalg import outer
 
 
 class LinkMoments(NamedTuple):
-    """Moments of z = G y + n: E[(G, n)] (m, p + 1), covariance of the gain and of the noise as in `SecondOrder`."""
+    """Moments of a link z = G y + n.
+
+    mean: E[(G, n)] (m, p + 1). gain_covariance: at [i, j, a, b] the covariance of G_ia and G_jb, with a last row and
+    column for n where gain and noise are correlated (m, m, p + 1, p + 1). noise: columns of Cov n else.
+    """
 
     mean: jax.Array
     gain_covariance: jax.Array
@@ -187,7 +191,8 @@ def _transform_by_link(x: Gaussian, link: LinkMoments, m: int) -> tuple[jax.Arra
     noise is (n - E n) + (G - E G) y: a random gain acts like noise with a covariance that depends on E[y y'].
     """
     mean_y, slopes_y = x.mean[-m:], x.root[-m:]
-    gain, offset = link.mean[:, :-1], link.mean[:, -1]  # E G, E n
+    gain = link.mean[:, :-1]  # E G
+    offset = link.mean[:, -1]  # E n
     second_moment = WeightedColumns(slopes_y, x.variances).covariance + outer(mean_y, mean_y)  # E[y y']
     noise = join_columns(link.noise, factor_gain_noise(link.gain_covariance, second_moment, mean_y))
     return gain @ mean_y + offset, gain @ slopes_y, noise

@@ -28,13 +28,23 @@ class SilenceByCause(NamedTuple):
 def split_by_obligation(
     status: jax.Array, has_sent: jax.Array, heartbeat: Int[Array, ""] | None
 ) -> tuple[jax.Array, jax.Array]:
-    """Split probabilities of a sender's status (K, M, A, C): its rule decides whether it sends, or it must send.
+    """Split probabilities of a sender's status in two: those where its rule decides whether it sends, or it must send.
 
-    It must send if it never has, and once the number of steps since it sent (axis A) equals `heartbeat`, if there is
-    one. Otherwise it sends if |y - r| > delta. The two arrays sum to `status`.
+    A sender sends its signal y if |y - r| > delta, where r is the reference that it compares with. But it must send,
+    wherever y lies, if it never has, and once the steps since it sent equal `heartbeat`, if there is one.
+
+    Args:
+        status: probabilities (K, M, A, C) of the status: Gaussian k of the filter's sum, mode m of the link, a steps
+            since the sender sent, c transmissions lost.
+        has_sent: whether it has sent at all.
+        heartbeat: largest number of steps without sending, or None.
+
+    Returns:
+        The parts of `status` where the rule decides, and where it must send; they sum to `status`.
     """
-    ages = status.shape[2]
-    is_heartbeat = (jnp.arange(ages) == (-1 if heartbeat is None else heartbeat))[:, None]
+    longest_silence = -1 if heartbeat is None else heartbeat  # -1 steps never occur
+    ages = jnp.arange(status.shape[2])
+    is_heartbeat = (ages == longest_silence)[:, None]  # along the axis of steps since it sent
     must_send = jnp.where(~has_sent | is_heartbeat, status, 0.0)
     return status - must_send, must_send
 

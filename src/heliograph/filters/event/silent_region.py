@@ -35,7 +35,10 @@ class SilentRegion(NamedTuple):
         return self.trigger.region == "ball" and self.outputs > 1
 
     def count_outside_parts(self, sender: slice) -> int:
-        """Return the number of pieces that the outside of a sender's region is cut into."""
+        """Return the number of pieces that `truncate_outside` cuts the outside |y - r| > delta into.
+
+        These are two for each component, above and below its interval, and for a ball the rest of the box around it.
+        """
         return 2 * len(range(self.outputs)[sender]) + self.is_ball
 
     def _error_directions(self, sender: slice) -> list[tuple[jax.Array, jax.Array]]:

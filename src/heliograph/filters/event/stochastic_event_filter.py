@@ -64,7 +64,7 @@ class StochasticEventFilter(AbstractSizedFilter):
 
     @property
     def silence_tells(self) -> bool:
-        """Always true: silence is a measurement."""
+        """Always True: the sender is silent by a rule on its signal, so that silence is a measurement."""
         return True
 
     @compile_on_call
@@ -164,7 +164,8 @@ class StochasticEventFilter(AbstractSizedFilter):
             log_silent: log P(silent) before the value.
         """
         # If a component is missing, the innovation is returned unchanged; 0 and I only stand in for NaN here.
-        value, covariance = jnp.asarray(innovation.value), jnp.asarray(innovation.covariance)
+        value = jnp.asarray(innovation.value)
+        covariance = jnp.asarray(innovation.covariance)
         is_complete = ~jnp.any(jnp.isnan(value))
         shift, change = self._find_moment_changes_given_sent(link, signal, reference, log_silent)
         complete = jnp.where(is_complete, value, 0.0), jnp.where(is_complete, covariance, jnp.eye(len(value)))
@@ -279,7 +280,7 @@ class StochasticEventFilter(AbstractSizedFilter):
         return innovations.log_density(jnp.ones(len(size), bool), size) + self._log_silence_normaliser(), after
 
     def _inverse_weight(self) -> jax.Array:
-        """Return W^-1, the noise with which silence is a measurement."""
+        """Return W^-1 (m, m): silence, of probability exp(-e' W e / 2), is a measurement of y with this noise."""
         assert isinstance(self.trigger, StochasticTrigger)
         return psd_solve(self.trigger.matrix(self.outputs), jnp.eye(self.outputs))
 
@@ -308,7 +309,7 @@ class StochasticEventFilter(AbstractSizedFilter):
 
     @estimates
     def estimate(self, state: StochasticBelief) -> Estimate:
-        """Return the mean and covariance of the Gaussian."""
+        """Return mean and covariance of the plant's state, and what the covariance is said to be (`claim`)."""
         return Estimate(state.gaussian.mean, state.gaussian.covariance, self.claim)
 
     def smoother_step(self, step: StepTrace) -> SmootherStep:
@@ -322,6 +323,14 @@ def _law_of_signal(signal: Signal) -> Gaussian:
 
 
 def _sum_of_one_gaussian(log_weight: jax.Array, belief: Gaussian, law: jax.Array) -> GaussianSum:
-    """Return a sum of one Gaussian, with the probabilities `law` of the link's modes as its status."""
-    alone: GaussianSum = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], GaussianSum(log_weight, belief, law[None]))
-    return alone
+    """Return a `GaussianSum` of one Gaussian, so that the functions for sums can be used.
+
+    Args:
+        log_weight: log of its weight.
+        belief: the Gaussian.
+        law: probabilities of the link's modes given the Gaussian (M,): the status of the one sender.
+    """
+    single = GaussianSum(log_weight, belief, status=law[None])
+    # The leading axis is that of the Gaussians in a sum.
+    sum_of_one: GaussianSum = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], single)
+    return sum_of_one

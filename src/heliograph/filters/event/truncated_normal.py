@@ -118,7 +118,9 @@ def upper_tail(lower: jax.Array) -> TruncatedNormalMoments:
     near = TruncatedNormalMoments(jnp.log(mass), hazard, 1 - hazard * (hazard - a))
     # Far out: u_n = n / (1 + x u_{n+1}), x = 1 / a^2, from u = 0 at DEPTH down to u_2 and u_1.
     a = jnp.maximum(lower, FAR)
-    x, numerator, denominator = 1 / (a * a), jnp.zeros_like(a), jnp.ones_like(a)
+    x = 1 / (a * a)
+    numerator = jnp.zeros_like(a)
+    denominator = jnp.ones_like(a)
     for n in range(DEPTH, 1, -1):
         numerator, denominator = n * denominator, denominator + x * numerator
     u_2 = numerator / denominator

@@ -52,7 +52,7 @@ BLOCKS = 64  # blocks of rows that one call predicts without data
 
 
 class ChunkLengths(NamedTuple):
-    """Rows of a chunk, and rows ahead of it in which its start is forgotten."""
+    """chunk: rows of a chunk. ahead: rows filtered before its first one (warm-up), in which the start is forgotten."""
 
     chunk: int
     ahead: int
@@ -87,7 +87,7 @@ class ChunkStarts(NamedTuple):
 
 
 def is_long(total: int) -> bool:
-    """Test whether rows are enough to be divided into chunks."""
+    """Return whether a recording of `total` rows is long enough for CHUNKS chunks of the least length."""
     return total >= CHUNKS * LADDER[0].chunk
 
 
@@ -175,7 +175,7 @@ def _predict_data_free_parts(recursion: Recursion, state: PyTree, rows: PyTree, 
     """
 
     def predict_row(state: PyTree, row: tuple[PyTree, Array]) -> tuple[PyTree, None]:
-        """Predict over one row."""
+        """Return the state predicted over one row, (data, number), without its measurement; no output."""
         return recursion.predict(state, *row), None
 
     def predict_block(state: PyTree, rows: tuple[PyTree, Array]) -> tuple[PyTree, PyTree]:
@@ -201,7 +201,7 @@ class WarmUpRun(NamedTuple):
 
     @property
     def ahead(self) -> int:
-        """Number of rows of a block."""
+        """Number of rows filtered before a chunk's first one; also the rows of a block in `complete`."""
         return self.complete.size
 
     def states_before(self, rows: Int[np.ndarray, " n"], starts: PyTree, one_start_each: bool = False) -> PyTree | None:
@@ -297,7 +297,7 @@ def _replace_data_free_parts(recursion: Recursion, start: PyTree, rows: PyTree, 
 
 
 class ChunkPrograms(NamedTuple):
-    """Functions that scan a chunk: `full`, or `settled` by means alone; `complete` adds what depends on no data."""
+    """Functions that filter a chunk: `full`, or `settled`: means alone, to which `complete` adds the other outputs."""
 
     full: Callable[..., Any]
     settled: Callable[..., Any]

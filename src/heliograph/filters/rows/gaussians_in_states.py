@@ -40,19 +40,21 @@ def find_equal_states(
     """
     # Each comparison: (number, other number, allowed difference beside some roundings of the number itself).
     # First the arrays that belong to no Gaussian; then means and covariances of the Gaussians, and of derivatives.
-    comparisons = [(a, b, np.zeros(())) for a, b in zip(*map(_other_leaves, (states, others)), strict=True)]
+    no_difference = np.zeros(())
+    comparisons = [(a, b, no_difference) for a, b in zip(_other_leaves(states), _other_leaves(others), strict=True)]
     largest_slopes = _find_largest_slopes(others if among is None else among)
-    for x, y in zip(*map(_moving_parts, (states, others)), strict=True):
+    # A state lists each Gaussian and then its derivatives, which are compared in units of the Gaussian's deviations.
+    for x, y in zip(_moving_parts(states), _moving_parts(others), strict=True):
         p, q = np.asarray(x.covariance), np.asarray(y.covariance)
         if isinstance(y, Gaussian):
-            deviation, deviation_products = _deviations(q)
+            deviation, deviation_products = _deviations(q)  # also of the derivatives that follow
             ratio = np.abs(y.mean) / np.where(deviation > 0, deviation, np.inf)
-            largest_ratio = np.max(ratio, axis=-1, keepdims=True, initial=0.0)
+            mean_tolerance = tolerance + ROUNDING * np.max(ratio, axis=-1, keepdims=True, initial=0.0)
             size = 1.0
-        else:  # derivatives of the Gaussian of the iteration before, in units of its deviations
+        else:
             size = next(largest_slopes)
         comparisons += [
-            (x.mean, y.mean, size * (tolerance + ROUNDING * largest_ratio) * deviation),
+            (x.mean, y.mean, size * mean_tolerance * deviation),
             (p, q, size * tolerance * deviation_products),
         ]
     agree = [_are_near(*numbers).reshape(len(numbers[0]), -1).all(axis=1) for numbers in comparisons]
@@ -94,12 +96,12 @@ def _are_near(a: np.ndarray, b: np.ndarray, within: np.ndarray) -> Bool[np.ndarr
 
 
 def select_state(condition: Array, if_true: PyTree, if_false: PyTree) -> PyTree:
-    """Return one state where a condition holds, else the other."""
+    """Return `if_true` where the condition (a traced boolean) holds, else `if_false`, array by array."""
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), if_true, if_false)
 
 
 def gaussians_of(state: PyTree) -> list[Gaussian]:
-    """Return the Gaussians of a state."""
+    """Return the Gaussians that a filter's state holds, in the order of its fields."""
     return [part for part in _moving_parts(state) if isinstance(part, Gaussian)]
 
 

@@ -17,17 +17,22 @@ class Recursion(Module):
     """Recursion of a linear filter over rows (z, u): data change only the means of the Gaussians in its state."""
 
     def step(self, state: PyTree, row: tuple[PyTree, Array], k: Array) -> tuple[PyTree, PyTree]:
-        """Return the state after row k, and what is kept of the row."""
+        """Return the state after row k, from that before it and the row's data (z, u), and the row's output."""
         raise unwritten(self, "step")
 
     def predict(self, state: PyTree, row: tuple[PyTree, Array], k: Array) -> PyTree:
-        """Return the state after row k where none of its data arrived."""
-        missing = jax.tree.map(lambda leaf: jnp.full_like(leaf, jnp.nan), row[0])
-        return self.step(state, (missing, row[1]), k)[0]
+        """Return the state predicted over row k, as if nothing of its measurement z had arrived (NaN)."""
+        z, u = row
+        missing = jax.tree.map(lambda leaf: jnp.full_like(leaf, jnp.nan), z)
+        after, _ = self.step(state, (missing, u), k)
+        return after
 
 
 class FilterRecursion(Recursion):
-    """Recursion of one filter, that puts out output(filter, state, innovation, k) of a row; `begin` is the first k."""
+    """Recursion of one filter, with output(filter, state, innovation, k) as the output of row k.
+
+    begin: the number k of the first row.
+    """
 
     filter: Any
     output: Callable[..., PyTree] = eqx.field(static=True)
@@ -115,5 +120,5 @@ def state_after_rows(recursion: Recursion, state: PyTree, rows: PyTree, first: A
 
 
 def make_row_numbers(rows: PyTree, first: Array) -> Array:
-    """Return the numbers of rows, from `first` on."""
+    """Return the numbers first, first + 1, ... of the rows (rows, ...)."""
     return first + jnp.arange(len(jax.tree.leaves(rows)[0]))

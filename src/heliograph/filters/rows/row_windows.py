@@ -9,7 +9,7 @@ import numpy as np
 from heliograph.engine.choice import choose_code
 from heliograph.numerics.types import Int, PyTree
 
-Which = slice | np.ndarray  # some of several, by their numbers
+Which = slice | np.ndarray  # which entries of a leading axis: a slice, or their indices
 
 
 class WindowBatch(NamedTuple):
@@ -89,5 +89,5 @@ def run_and_join(
 
 
 def take(states: PyTree, which: Which) -> PyTree:
-    """Return some entries, along the leading axis of every array."""
+    """Return the states with the indices `which`, from states stacked along the leading axis of every array."""
     return jax.tree.map(lambda leaf: leaf[which], states)

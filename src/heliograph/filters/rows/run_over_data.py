@@ -34,7 +34,7 @@ from heliograph.numerics.trace_settings import KEPT
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 
 Rows = np.ndarray  # an entry for each step along the first axis
-FEW = 10  # effective number of particles below which their moments say nothing
+FEW = 10  # with a lower effective number of particles their mean and covariance say nothing
 
 
 class SteppedFilter(Protocol):
@@ -57,19 +57,19 @@ class SteppedFilter(Protocol):
         """Number of steps that it covers."""
 
     def init(self) -> PyTree:
-        """Return the state before the first row."""
+        """Return the filter's state before the first row."""
 
     def predict(self, state: PyTree, u: ArrayLike, k: Array) -> PyTree:
-        """Return the prior of a row."""
+        """Return the state predicted over step k with the input u."""
 
     def correct(self, state: PyTree, z: ArrayLike, k: Array) -> tuple[PyTree, Innovation]:
-        """Return the posterior of a row, and its innovation."""
+        """Return the state corrected with the measurement z of step k, and the innovation."""
 
     def after_step(self, state: PyTree, k: Array) -> Estimate:
-        """Return the estimate of a row."""
+        """Return mean and covariance of the plant's state after step k."""
 
     def filter_rows(self, z: Array, u: Array, state: PyTree | None = None, begin: Array | int = 0) -> ScanResult | None:
-        """Filter rows by native code of its own, None where it has none."""
+        """Return last state and outputs of rows by native code of the filter's own; None where it has none."""
 
 
 @readable
@@ -115,7 +115,10 @@ def scan_inside_jit(
     u: Float[Array, "steps inputs"],
     output: Callable[[PyTree, Innovation, jax.Array], PyTree],
 ) -> PyTree:
-    """Step a filter over rows inside a compiled computation; return output(state, innovation, k) of all rows."""
+    """Step a filter over rows inside a compiled computation, without checks; return the outputs of all rows, stacked.
+
+    The output of row k is output(state after it, innovation, k).
+    """
     _, outputs = scan_with_last_state(filter, z, u, output)
     return outputs
 
@@ -211,9 +214,9 @@ def step_over_known_rows(
     output: Callable[[Any, PyTree, Innovation, Array], PyTree],
     start: tuple[PyTree, Array] | tuple[()] = (),
 ) -> tuple[PyTree, PyTree]:
-    """Step a filter over rows of data outside of any trace; return the last state and the outputs, stacked.
+    """Step a filter over rows of known numbers (not traced by JAX); return the last state and the outputs, stacked.
 
-    One program of native code serves any number of rows; XLA computes what it does not take.
+    Native code that is compiled once serves any number of rows; XLA scans them if the filter has other operations.
 
     Args:
         filter: the filter.
@@ -254,13 +257,19 @@ def _step_alone(filter: Any, state: PyTree, z: Array, u: Array, k: Array) -> tup
 
 
 def _begin(fixed: tuple[Any, ...]) -> PyTree:
-    """Return the state before the first row: the one that is given with the filter, or else the filter's own."""
+    """Return the state before the first row: the given one, or else the filter's own.
+
+    `fixed` is what is the same for all rows: filter, output function, and perhaps the first state and row number.
+    """
     filter, _, *start = fixed
     return jax.tree.map(jnp.asarray, start[0] if start else filter.init())
 
 
 def _step(fixed: tuple[Any, ...], state: PyTree, row: tuple[Array, ...]) -> tuple[PyTree, PyTree]:
-    """Return the state after a row (number, measurement, input), and what is kept of the row."""
+    """Return the state after a row (number, measurement, input), and the row's output.
+
+    `fixed` is what is the same for all rows: filter, output function, and perhaps the first state and row number.
+    """
     filter, output, *_ = fixed
     k, z, u = row
     after, innovation = filter.correct(filter.predict(state, u, k), z, k)
@@ -268,7 +277,7 @@ def _step(fixed: tuple[Any, ...], state: PyTree, row: tuple[Array, ...]) -> tupl
 
 
 def _make_end_origin(filter: SteppedFilter, state: PyTree, end: int, u: Array, dates: np.ndarray | None) -> Origin:
-    """Return where a record ends, from which a later call or a forecast goes on.
+    """Return the end of a run, from which a later run or a forecast goes on: state, step, last inputs, last time.
 
     Args:
         filter: the filter.
@@ -306,7 +315,11 @@ def _warn_of_lost_estimate(filter: SteppedFilter, mean: np.ndarray, begin: int) 
 
 
 def _find_origin_of_earlier_result(filter: SteppedFilter, after: Filtered) -> Origin:
-    """Return where an earlier result of this filter ended; raise ValueError if it is another filter's."""
+    """Return the state and step number at which an earlier result of this filter ended, from which `run` goes on.
+
+    Raises:
+        ValueError: a result without them, or one of another kind of filter (another form of its state).
+    """
     expected = "what `run` of this filter returned for the rows before"
     origin = instance("after", after, Filtered, expected).origin
     if origin is None:
@@ -317,7 +330,7 @@ def _find_origin_of_earlier_result(filter: SteppedFilter, after: Filtered) -> Or
 
 
 def _check_dates_increase(before: Origin, dates: np.ndarray) -> None:
-    """Check that dates of rows are behind that of the last row before them, where it has one."""
+    """Raise ValueError unless the first date is after that of the last row before, if that row has a date."""
     if isinstance(before.time, np.datetime64) and not dates[0] > before.time:
         raise fail("measurements", f"rows behind {before.time}, the last one before them", str(dates[0]))
 

@@ -40,7 +40,7 @@ class SettledState(NamedTuple):
     varies: tuple[bool, ...]
 
     def repeat_with_means(self, means: Sequence[np.ndarray]) -> PyTree:
-        """Return states (n, ...) with these means (n, ...)."""
+        """Return n copies of the settled state, along a leading axis, with these means (n, ...) in place of its own."""
         return with_means(repeat_state(self.state, len(means[0])), means)
 
     def fill_rows(self, varying: list[np.ndarray]) -> PyTree:
@@ -65,16 +65,20 @@ class SettledState(NamedTuple):
         `self.varies` says of each leaf whether it depends on data. All others are those of `self.outputs`, the output
         of a settled row.
         """
-        next_varying, leaves = iter(varying), jax.tree.leaves(self.outputs)
+        next_varying = iter(varying)
+        leaves = jax.tree.leaves(self.outputs)
         joined = [next(next_varying) if varies else leaf for leaf, varies in zip(leaves, self.varies, strict=True)]
         return jax.tree.unflatten(jax.tree.structure(self.outputs), joined)
 
     def select_varying(self, output: PyTree) -> list[Any]:
-        """Return the leaves of a row's output that depend on data."""
+        """Return the leaves of a row's output that depend on data, those for which `self.varies` is True."""
         return [leaf for leaf, varies in zip(jax.tree.leaves(output), self.varies, strict=True) if varies]
 
     def matches(self, states: PyTree) -> Bool[np.ndarray, " n"]:
-        """Return which of the states (n, ...) equal this one in all but the means."""
+        """Return which of the states (n, ...) have the covariances of this one, and all else but the means.
+
+        In such a state the covariances and gains no longer change, so that only means need be computed.
+        """
         means = means_of(states)
         no_means = [()] * len(means)  # an empty tuple has no leaves, so that means are not compared
         other_leaves, own_leaves = (jax.tree.leaves(with_means(x, no_means)) for x in (states, self.state))
@@ -158,13 +162,14 @@ def _repeat_row_over_windows(recursion: Recursion, start: PyTree, row: PyTree, n
 
 
 def find_data_dependent_leaves(recursion: Recursion, start: PyTree, row: PyTree) -> tuple[bool, ...] | None:
-    """Return for each leaf of a complete row's output whether it depends on data, or None if nothing can settle.
+    """Return for each array in the output of a complete row whether it depends on data; None if nothing can settle.
 
     Returns None if other parts of the state than its means depend on data, or without native code. The compiled code
     says for each result, in `choice.code.common`, whether it is the same for runs with different means and rows.
     """
     rows = jax.tree.map(lambda leaf: leaf[None], row)
     means = [np.asarray(mean)[None] for mean in means_of(start)]
+    # Native code of one step (None if there is none), for runs with the same state but other means, rows and numbers.
     arguments = recursion, start, means, rows, np.zeros(1, int)
     choice = choose_code(step_settled, arguments, differs_by_run=[False, False, True, True, True])
     if choice.code is None:

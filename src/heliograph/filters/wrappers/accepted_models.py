@@ -52,7 +52,7 @@ def accept_limits(make: Callable[P, F]) -> Callable[P, F]:
 
 
 def accept_sensor_inputs(make: Callable[P, F]) -> Callable[P, F]:
-    """Let a function that makes a filter take sensors that depend on inputs, by a `FilterOfInputs` of what it makes.
+    """Decorate a function that makes a filter, so that it accepts sensors y = h(x, u) + v that depend on inputs u.
 
     Most filters know only sensors without inputs. For a sensor y = h(x, u) a filter is made for typical inputs, and a
     wrapper gives it the sensor of the present inputs at each step.
@@ -67,7 +67,7 @@ def accept_sensor_inputs(make: Callable[P, F]) -> Callable[P, F]:
 
     @wraps(make)
     def build_with_inputs(*args: P.args, **kwargs: P.kwargs) -> F:
-        """Make the filter as it is, or one of inputs around it where the sensor depends on some."""
+        """Call `make`; if the sensor depends on inputs, wrap what it makes in a `FilterOfInputs`."""
         given = parameters.bind(*args, **kwargs).arguments
         sensor = first(given.get("sensor"))
         # What is no sensor has no inputs, and is for `make` to refuse.
@@ -90,11 +90,11 @@ def accept_sensor_inputs(make: Callable[P, F]) -> Callable[P, F]:
 
 
 def accept_told_numbers(make: Callable[P, F]) -> Callable[P, F]:
-    """Let a function that makes a filter take channels that report numbers of their law with each message.
+    """Decorate a function that makes a filter, so that it accepts channels that report numbers with each message.
 
-    Such numbers, a gain or a noise variance, are told to the receiver as part of z. A decorated function then makes a
-    `ToldFilter`, which reads the numbers and corrects by a filter of the law that they give. Behind any other channel
-    the function is unchanged; its return type is also kept for type checkers.
+    Such numbers ("told" numbers, channel side information), as the present gain or noise variance, are components of
+    z. The decorated function then makes a `ToldFilter`, which reads the numbers and corrects by a filter of the law
+    that they give. Behind any other channel the function is unchanged.
 
     Args:
         make: a function of a plant, a sensor, a channel, and more.

@@ -90,14 +90,18 @@ class ClockFilter(AbstractWrapper):
     def init(self) -> ClockBelief:
         """Return the law of plant and clocks before any data, in which no clock is observable yet."""
         start = self.base.init()
-        # After n steps of silence a component does not count: so it is for all components before they arrive.
+        # A component that has not arrived for n steps, the number of states, does not count; none has arrived yet.
         silence = jnp.full(self.received, len(self.states))
         observed = jnp.zeros(len(self.offsets), dtype=bool)
         return ClockBelief(gaussian=start, inputs=jnp.zeros(len(self.inputs)), silence=silence, observed=observed)
 
     @predicts
     def predict(self, state: ClockBelief, u: ArrayLike = (), k: Step = 0) -> ClockBelief:
-        """Predict plant and clocks over step k; each component's steps since it last arrived (`silence`) grow by 1."""
+        """Predict plant and clocks over step k.
+
+        The inputs are kept, since the test of observability in `correct` goes on along the motion under them. `silence`
+        counts the steps since each component of z last arrived, and grows by 1.
+        """
         predicted = self.base.predict(state.gaussian, u, k)
         return ClockBelief(
             gaussian=predicted, inputs=jnp.asarray(u, dtype=float), silence=state.silence + 1, observed=state.observed
@@ -112,7 +116,7 @@ class ClockFilter(AbstractWrapper):
         not observable get the gain 0: they keep mean and covariance, and the others are corrected in spite of them.
         """
         base = self.base
-        # Moments of the signal, and the expected measurement E[z] = M E[y] + b.
+        # Moments of the signal y = h(x) + v, and the expected measurement E[z] = M E[y] + b.
         channel: SecondOrder = at(base.channel, k)
         sensor, prior = at(base.sensor, k), state.gaussian
         signal = find_signal_moments(
@@ -121,7 +125,8 @@ class ClockFilter(AbstractWrapper):
         expected = jnp.asarray(channel.mean_gain @ signal.mean + channel.offset)
         z = wrap_near(jnp.asarray(z), expected, base.observed_angles)
         # Innovation covariance S, for all components.
-        present, total = ~jnp.isnan(z), jnp.asarray(innovation_covariance(signal, channel))
+        present = ~jnp.isnan(z)
+        total = jnp.asarray(innovation_covariance(signal, channel))
         # Observability is tested over n steps, as many as there are states: components that have not arrived for n
         # steps would not have been in these data, and do not count.
         silence = jnp.where(present, 0, state.silence)
@@ -135,7 +140,8 @@ class ClockFilter(AbstractWrapper):
             spread = prior.mean**2 + diagonal(prior.covariance)
             known = prior.variances <= jnp.maximum((KNOWN * unit_of(spread)) ** 2 * spread, SMALLEST)
             gain = spoil_derivatives(gain, jnp.any(known))
-        slopes, noise = jnp.asarray(channel.mean_gain) @ signal.slopes, make_received_noise(signal, channel)
+        slopes = jnp.asarray(channel.mean_gain) @ signal.slopes
+        noise = make_received_noise(signal, channel)
         after = correct_by_gain(prior, slopes, noise, gain, jnp.where(present, z - expected, 0.0))
         belief = ClockBelief(gaussian=after, inputs=state.inputs, silence=silence, observed=observed)
         return belief, gaussian_innovation(z, expected, total)
@@ -159,7 +165,8 @@ class ClockFilter(AbstractWrapper):
         1e-3, that is linearly independent of those by the other states.
         """
         jacobian = jax.jacfwd(observe)
-        slopes, curvature = jacobian(state.gaussian.mean), jax.jacfwd(jacobian)(state.gaussian.mean)
+        slopes = jacobian(state.gaussian.mean)
+        curvature = jax.jacfwd(jacobian)(state.gaussian.mean)
         independent_share = self._independent_shares(state, observe, k)
         observable = []
         for i, offset in enumerate(self.offsets):
@@ -208,7 +215,8 @@ def _compute_unexplained_share(gramian: jax.Array, column: int) -> jax.Array:
     scale = jnp.where(lengths > 0, 1 / jnp.where(lengths > 0, lengths, 1.0), 0.0)
     correlations = scale[:, None] * gramian * scale
     others = jnp.array([i for i in range(gramian.shape[0]) if i != column])
-    R, r = correlations[jnp.ix_(others, others)], correlations[others, column]
+    R = correlations[jnp.ix_(others, others)]
+    r = correlations[others, column]
     values, vectors = eigh(R)
     is_used = values > RANK * values[-1]
     explained = jnp.sum(jnp.where(is_used, (vectors.T @ r) ** 2 / jnp.where(is_used, values, 1.0), 0.0))

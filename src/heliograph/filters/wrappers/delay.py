@@ -41,7 +41,10 @@ class PartFilter(AbstractWrapper):
     base: AbstractFilter
 
     def __init__(self, base: AbstractFilter, states: int):
-        """Wrap the filter `base` so that only its first `states` states are estimated."""
+        """Wrap the filter `base` so that only its first `states` states are estimated.
+
+        What its covariance is said to be (`claim`), its inputs, and the length of z (`received`) stay those of `base`.
+        """
         self.base, self.claim, self.states = base, base.claim, base.states[:states]
         self.inputs, self.received, self.kept = base.inputs, base.received, base.kept
 
@@ -119,7 +122,7 @@ class RelayLinesFilter(AbstractWrapper):
         return state
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
-        """Precompute all covariances and gains."""
+        """Return the filter with all covariances and gains computed for these inputs (horizon, inputs)."""
         return plan_filter(self, inputs, np.eye(len(self.states), len(self.base.states)))
 
 
@@ -129,14 +132,17 @@ def _receive_into_line(state: LinearBelief, link: SecondOrder, relay: RelayLine)
     l is the delay line, a part of the state, of the sensor or relay that sends. `link` has the moments of G and n, with
     M = E G and b = E n, and `relay` the indices of l and of r in the state.
     """
-    gain, offset = jnp.asarray(link.mean_gain), jnp.asarray(link.offset)
+    gain = jnp.asarray(link.mean_gain)
+    offset = jnp.asarray(link.offset)
     total, m = len(state.gaussian.mean), len(offset)
-    line, received = slice(relay.start, relay.start + relay.length), slice(relay.received, relay.received + m)
+    line = slice(relay.start, relay.start + relay.length)
+    received = slice(relay.received, relay.received + m)
     # The state becomes `matrix` x + `offset_of_state` + noise: M l + b in the entries `received`, all others unchanged.
     matrix = jnp.eye(total).at[received, :].set(0.0).at[received, line].set(gain)
     offset_of_state = jnp.zeros(total).at[received].set(offset)
     # E Cov(r given l), by E[l l'] before any data: a random gain multiplies l itself.
-    mean, covariance = state.state_mean[line], state.state_covariance[line, line]
+    mean = state.state_mean[line]
+    covariance = state.state_covariance[line, line]
     link_noise = factor_link_noise(link, covariance + jnp.outer(mean, mean), mean)
     noise_columns = jnp.zeros((total, link_noise.matrix.shape[1])).at[received].set(link_noise.matrix)
     noise = WeightedColumns(noise_columns, link_noise.weights)
@@ -170,7 +176,8 @@ def enlarge_by_relays(
         append_line = partial(_append_relay_line, relay=i, size=stage_to_relay.outputs, steps=stage_from_relay.past)
         larger = at_each_step(append_line, larger)
     # The receiver measures the line of the last relay, without noise of its own.
-    matrix, no_noise = np.eye(total)[line_start:], np.zeros((total - line_start, total - line_start))
+    matrix = np.eye(total)[line_start:]
+    no_noise = np.zeros((total - line_start, total - line_start))
     last_line_sensor = LinearSensor(matrix, no_noise, first(larger).states[line_start:])
     return larger, last_line_sensor, place_on_delay_line(channel.stages[-1]), tuple(lines)
 
@@ -182,7 +189,8 @@ def _append_relay_line(plant: PyTree, relay: int, size: int, steps: int) -> Line
     """
     length = size * (1 + steps)
     names = [f"relay_{relay}_{j}_{d}_ago" for d in range(1 + steps) for j in range(size)]
-    shift_matrix, no_noise = np.kron(np.eye(1 + steps, k=-1), np.eye(size)), np.zeros((length, length))
+    shift_matrix = np.kron(np.eye(1 + steps, k=-1), np.eye(size))
+    no_noise = np.zeros((length, length))
     line = LinearPlant(shift_matrix, no_noise, np.zeros(length), no_noise, states=names)
     return append_driving_plant(plant, line, np.zeros((len(plant.states), length)))
 
@@ -238,7 +246,10 @@ def _build_behind_relays(plant: AnyPlant, sensor: AnySensor, channel: Channel, m
 
 
 def deliver_line_as_current(channel: Channel) -> Channel:
-    """Return the channel for a filter that takes late signals for current ones: its delay line holds y_k everywhere."""
+    """Return the channel as it is to a filter that takes late signals for current ones.
+
+    A late channel is a map of the delay line (y_k, y_k-1, ...) of the last signals. Here all its entries are y_k.
+    """
     current: Channel = at_each_step(_deliver_at_once, channel)
     return current
 

@@ -28,7 +28,7 @@ from heliograph.numerics.types import Array, ArrayLike, Float
 
 
 class BeliefAndPrior(NamedTuple):
-    """Corrected belief, and the prediction before the correction."""
+    """belief: mean and covariance given z_0 ... z_k. prior: those given z_0 ... z_k-1, which are the estimate."""
 
     belief: Gaussian
     prior: Gaussian
@@ -43,7 +43,10 @@ class PredictionFilter(AbstractWrapper):
     base: GaussianFilter
 
     def __init__(self, base: GaussianFilter):
-        """Wrap the Gaussian filter `base`, whose predictions are to be the estimates."""
+        """Wrap the Gaussian filter `base`, whose predictions are to be the estimates.
+
+        Claim (what the covariance is said to be), states, inputs and length of z (`received`) are those of `base`.
+        """
         self.base, self.claim = base, base.claim
         self.states, self.inputs, self.received, self.kept = base.states, base.inputs, base.received, base.kept
 
@@ -53,18 +56,24 @@ class PredictionFilter(AbstractWrapper):
 
     @in_float64
     def init(self) -> BeliefAndPrior:
-        """Return the prior of the filter, twice."""
+        """Return the law of x_0, which is both the belief and the estimate before any data."""
         return BeliefAndPrior(self.base.init(), self.base.init())
 
     @predicts
     def predict(self, state: BeliefAndPrior, u: ArrayLike = (), k: Step = 0) -> BeliefAndPrior:
-        """Predict with the filter; the correction will not change the stored prior."""
+        """Predict over step k from the belief given z_0 ... z_k-1; the result is the estimate of step k.
+
+        `correct` will change the belief, but not the stored prediction (`prior`).
+        """
         prior = self.base.predict(state.belief, u, k)
         return BeliefAndPrior(prior, prior)
 
     @corrects
     def correct(self, state: BeliefAndPrior, z: ArrayLike, k: Step = 0) -> tuple[BeliefAndPrior, Innovation]:
-        """Correct the belief for the next step; the estimate stays the prediction."""
+        """Correct the belief with z_k, from which the prediction of step k + 1 will start.
+
+        The estimate of step k stays its prediction, `prior`, which does not use z_k.
+        """
         belief, innovation = self.base.correct(state.belief, z, k)
         return BeliefAndPrior(belief, state.prior), innovation
 
@@ -111,7 +120,7 @@ class FedBackFilter(AbstractWrapper):
     base: GaussianFilter
 
     def within(self, state: FedBackBelief) -> Gaussian:
-        """Return the belief of the plant's state."""
+        """Return mean and covariance of the plant's state, without the reference."""
         return state.gaussian
 
     def predict_reference(
@@ -125,7 +134,7 @@ class FedBackFilter(AbstractWrapper):
 
     @in_float64
     def init(self) -> FedBackBelief:
-        """Return the belief before any data."""
+        """Return the law of x_0, and a reference of zeros, since nothing has been predicted yet."""
         return FedBackBelief(self.base.init(), jnp.zeros(len(first(self.base.sensor).outputs)))
 
     @predicts
@@ -136,7 +145,11 @@ class FedBackFilter(AbstractWrapper):
 
     @corrects
     def correct(self, state: FedBackBelief, z: ArrayLike, k: Step = 0) -> tuple[FedBackBelief, Innovation]:
-        """Correct with the measurement of y - r, r the reference that the sender subtracts from its signal y."""
+        """Correct with z = G (y - r) + n, where r is the reference that the sender subtracts from its signal y.
+
+        The moments of y under the belief give those of y - r, the signal that is sent. Then the correction is that of
+        `base` (its channel and its update rule) for this signal. r is known, so that it adds no uncertainty.
+        """
         base = self.base
         plant, sensor = at(base.plant, k), at(base.sensor, k)
         initial_power = second_moments_at_start(base.plant, base)
@@ -178,7 +191,8 @@ def fed_back_filter(
     Source: Schalkwijk and Kailath, A coding scheme for additive noise channels with feedback (1966), for a state that
         moves; Elia, Remote stabilization over fading channels (2005).
     """
-    chosen, rule = Cubature() if transform is None else transform, Polytope() if update is None else update
+    chosen = Cubature() if transform is None else transform
+    rule = Polytope() if update is None else update
     base = make_base_gaussian_filter("filter that is fed back", plant, sensor, channel, chosen, rule)
     refuse_angles("filter that is fed back", plant, sensor)
     # Exact: linear, the channel's moments known, no memory of the channel that a filter could use, the standard update.

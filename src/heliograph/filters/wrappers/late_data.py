@@ -46,13 +46,16 @@ class LateFilter(AbstractWrapper):
     delay: int = eqx.field(static=True)
 
     def __init__(self, base: AbstractFilter, delay: int):
-        """Wrap `base`, a filter of the link without delay, for measurements that arrive `delay` steps late."""
+        """Wrap `base`, a filter of the link without delay, for measurements that arrive `delay` steps late.
+
+        Claim (what the covariance is said to be), states, inputs and length of z (`received`) are those of `base`.
+        """
         self.base, self.delay, self.claim, self.states = base, delay, base.claim, base.states
         self.inputs, self.received = base.inputs, base.received
 
     @compile_on_call
     def init(self) -> LateState:
-        """Return the state before any signal was sent."""
+        """Return the state before step 0: the start of `base`, inputs of 0, and -1 as the last step."""
         start = jax.tree.map(jnp.asarray, self.base.init())
         return LateState(start, jnp.zeros((self.delay, len(self.inputs))), jnp.asarray(-1))
 
@@ -68,7 +71,7 @@ class LateFilter(AbstractWrapper):
         return LateState(predicted, inputs[1:], jnp.asarray(k, dtype=state.step.dtype))
 
     def _predict_if_begun(self, base: PyTree, u: jax.Array, k: jax.Array) -> PyTree:
-        """Predict over step k, or return the state as it is where k < 0."""
+        """Return the state of the filter `base` predicted over step k; unchanged if k < 0, before the first step."""
         after = self.base.predict(base, u, jnp.maximum(k, 0))
         return jax.tree.map(lambda new, old: jnp.where(k >= 0, new, old), after, base)
 
@@ -87,7 +90,7 @@ class LateFilter(AbstractWrapper):
 
     @estimates
     def estimate(self, state: LateState) -> Estimate:
-        """Return the prediction over the last `delay` steps."""
+        """Return the estimate of the present state: that of `delay` steps ago, predicted with the inputs since."""
 
         def predict_over(j: jax.Array, base: PyTree) -> PyTree:
             """Predict over the step j after that of the last signal."""
@@ -99,7 +102,7 @@ class LateFilter(AbstractWrapper):
         return self.base.estimate(present)
 
     def after_step(self, state: LateState, k: Step) -> Estimate:
-        """Return the prediction over the last `delay` steps."""
+        """Return the estimate of the state at step k, as `estimate` does."""
         return self.estimate(state)
 
 
@@ -141,9 +144,14 @@ class KnownDelayFilter(AbstractWrapper):
 
     @corrects
     def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
-        """Correct by the channel of the received delay, the last number of z; without a delay z is not used."""
+        """Correct with z, whose last number is the delay d of the value before it in steps.
+
+        The filter of past and present states uses the moments of the channel for this d. If d is missing (NaN), z is
+        not used, and the state stays.
+        """
         z, delay = jnp.asarray(z)[:-1], jnp.asarray(z)[-1]
-        is_known, longest = ~jnp.isnan(delay), len(self.channels.offset) - 1
+        is_known = ~jnp.isnan(delay)
+        longest = len(self.channels.offset) - 1
         d = jnp.clip(jnp.where(is_known, delay, 0.0).astype(int), 0, longest)
         channel = jax.tree.map(lambda leaf: jnp.asarray(leaf)[d] if eqx.is_array(leaf) else leaf, self.channels)
         base = eqx.tree_at(lambda filter: filter.channel, self.base, channel)
@@ -157,13 +165,18 @@ class KnownDelayFilter(AbstractWrapper):
 
 
 def build_known_delay_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: Make) -> KnownDelayFilter:
-    """Build the filter that receives each value's delay with it, with the channel's moments at every delay."""
+    """Build the filter behind a link with time stamps, which receives with each value how late it is.
+
+    The plant's state is enlarged by the past signals y_k-1, ..., y_k-D. The filter of this state is made for no delay,
+    and holds the moments of the link for each delay d = 0, ..., D, to take those of the delay that is received.
+    """
     if not isinstance(channel, DelayedLink):
         raise fail("channel with time stamps", "one that does not vary", "one in over_time")
     check_forgets("link with time stamps", channel.link)
     enlarged_plant, line_sensor, _ = with_past(plant, sensor, channel)  # a sensor that outputs all past signals
     links = [channel.given(d) for d in range(channel.past + 1)]  # one for each delay
-    base, start = make(enlarged_plant, line_sensor, links[0]), first(plant)
+    base = make(enlarged_plant, line_sensor, links[0])
+    start = first(plant)
     return KnownDelayFilter(
         base=base,
         channels=stack([second_order(link) for link in links]),

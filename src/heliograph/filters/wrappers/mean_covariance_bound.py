@@ -30,7 +30,7 @@ from heliograph.random_affine.reported_numbers import FreshNumbers, FreshReading
 MOST = 20_000  # combinations of numbers that are summed over
 
 
-# Of a step: a filter's state, covariances by mode (modes, n, n), and the modes' law (modes,).
+# What is carried from step to step: a filter's state, covariances by mode (modes, n, n), and the modes' law (modes,).
 Carry = tuple[LinearBelief, jax.Array, jax.Array]
 
 
@@ -97,7 +97,10 @@ def _bound_mean_covariance(filter: ToldFilter, told: ToldNumbersByMode, u: Array
     modes = len(told.initial)
 
     def bound_step(carry: Carry, row: tuple[jax.Array, jax.Array]) -> tuple[Carry, jax.Array]:
-        """Step over one row: the mean covariance in each mode, and as output that in the mean over the modes."""
+        """Bound the mean covariance V_j in each mode j after one row; the output is its mean over the modes.
+
+        `carry`: a filter's state, the bounds V_j before the row, and the modes' probabilities. `row`: number and input.
+        """
         state, before, law = carry
         k, u_k = row
 
@@ -157,18 +160,11 @@ def _list_told_numbers(filter: ToldFilter) -> ToldNumbersByMode:
     memories = [affine.memory for affine in list_told_maps(first(filter.link))]
     chains = [memory for memory in memories if isinstance(memory, MarkovChain)]
     if chains:
-        varies = np.ndim(chains[0].transition) > 2  # a transition matrix for each step
-        if len(memories) > 1 or chains[0].is_uncertain or varies:
+        chain = chains[0]
+        varies = np.ndim(chain.transition) > 2  # a transition matrix for each step
+        if len(memories) > 1 or chain.is_uncertain or varies:
             raise fail("numbers told", "one chain alone, of known probabilities", f"{len(memories)} maps")
-        # In mode i the number i is reported with weight 1: shapes (modes, 1, 1) and (modes, 1).
-        modes = chains[0].modes
-        numbers = np.arange(float(modes))[:, None, None]
-        return ToldNumbersByMode(
-            numbers=numbers,
-            weights=np.ones((modes, 1)),
-            initial=np.asarray(chains[0].initial),
-            transition=np.asarray(chains[0].transition),
-        )
+        return _list_numbers_of_chain(chain)
     # All combinations so far with each number of the next map: rows of `values`; their weights are products.
     values, weights = np.zeros((1, 0)), np.ones(1)
     for memory in memories:
@@ -179,6 +175,17 @@ def _list_told_numbers(filter: ToldFilter) -> ToldNumbersByMode:
         weights = np.outer(weights, chances).ravel()
     return ToldNumbersByMode(
         numbers=values[None], weights=weights[None], initial=np.ones(1), transition=np.ones((1, 1))
+    )
+
+
+def _list_numbers_of_chain(chain: MarkovChain) -> ToldNumbersByMode:
+    """Return the numbers that messages report of a chain's mode: in mode i the number i, with weight 1."""
+    numbers = np.arange(float(chain.modes))[:, None, None]  # (modes, nodes, told), one node and one number
+    return ToldNumbersByMode(
+        numbers=numbers,
+        weights=np.ones((chain.modes, 1)),
+        initial=np.asarray(chain.initial),
+        transition=np.asarray(chain.transition),
     )
 
 

@@ -56,12 +56,12 @@ class FilterOfInputs(AbstractWrapper):
     sensor: AnySensor
 
     def within(self, state: StateUnderInputs) -> PyTree:
-        """Return the state of the base filter."""
+        """Return the state of the base filter, without the inputs."""
         return state.base
 
     @in_float64
     def init(self) -> StateUnderInputs:
-        """Return the state before the first step."""
+        """Return the first state of the base filter, with inputs of 0."""
         return StateUnderInputs(self.base.init(), jnp.zeros(len(self.inputs)))
 
     @predicts

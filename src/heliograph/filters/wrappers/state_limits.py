@@ -59,7 +59,7 @@ class LimitedFilter(AbstractSizedFilter):
 
     @in_float64
     def init(self) -> PyTree:
-        """Return the state before the first step."""
+        """Return the first state of the base filter, which knows no limits."""
         return self.base.init()
 
     @predicts
@@ -72,7 +72,10 @@ class LimitedFilter(AbstractSizedFilter):
 
     @corrects
     def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
-        """Correct the prediction with its mean moved into the limits; the likelihood of z is given the limits."""
+        """Correct the prediction, its mean moved into the limits, with z.
+
+        The likelihood that is returned is p(z | x within the limits) = p(z) P(within | z) / P(within).
+        """
         after, innovation = self.base.correct(self.hold(state), z, k)
         # log p(z | within) = log p(z) + log P(within | z) - log P(within); no change where either P is 0 to rounding.
         log_within_after = self._log_probability_within(after)
@@ -113,16 +116,16 @@ class LimitedFilter(AbstractSizedFilter):
         return replace(inner, limits=self.limits, claim=weakest([inner.claim, "nominal"]))
 
     def angles_used(self) -> FilterAngles | None:
-        """Return the angles of the base filter."""
+        """Return which states, inputs and measured values are angles: those of the base filter."""
         return self.base.angles_used()
 
     @property
     def remarks(self) -> bool:
-        """True if the base filter may remark anything."""
+        """True if the base filter may have a remark on its state, such as that it diverges."""
         return self.base.remarks
 
     def remark(self, state: PyTree) -> Remark:
-        """Return the remark of the base filter."""
+        """Return what the base filter remarks on its state."""
         return self.base.remark(state)
 
     @property
@@ -131,11 +134,14 @@ class LimitedFilter(AbstractSizedFilter):
         return self.base.of_atoms
 
     def _with_own_claim(self, estimate: Estimate) -> Estimate:
-        """Return the estimate with this filter's claim."""
+        """Return the estimate with this filter's claim of what its covariance is ("nominal" at most)."""
         return replace(estimate, claim=self.claim)
 
     def _state_before_prediction(self, state: PyTree) -> PyTree:
-        """Return the state from which the next prediction starts."""
+        """Return the state from which the next prediction starts.
+
+        Particles outside the limits are dropped. A Gaussian keeps its covariance: only its mean is moved into them.
+        """
         return self.condition_on_limits(state) if _holds_particles(state) else self._hold_means(state)
 
     def _hold_means(self, state: PyTree) -> PyTree:
@@ -202,7 +208,8 @@ class LimitedFilter(AbstractSizedFilter):
         weights, and each one outside is mirrored at the limit that it exceeds: a value x > high becomes 2 high - x.
         """
         position = jnp.asarray(state.position)
-        inside, mirrored = jnp.ones(len(state.log_weight), bool), position
+        inside = jnp.ones(len(state.log_weight), bool)
+        mirrored = position
         for index, low, high in self.limits:
             value = position[:, index]
             inside = inside & (low <= value) & (value <= high)
@@ -225,7 +232,7 @@ def _holds_particles(state: PyTree) -> bool:
 
 
 def without_limits(plant: AnyPlant) -> AnyPlant:
-    """Return the plant without limits of its states."""
+    """Return a copy of the plant, of each step if it varies over time, without limits of its states."""
 
     def drop_limits(limited: AbstractPlant) -> AbstractPlant:
         """Return a copy of the plant of one step, without limits."""
@@ -238,11 +245,15 @@ def without_limits(plant: AnyPlant) -> AnyPlant:
 
 
 def build_limited_filter(base: AbstractFilter, plant: AnyPlant) -> LimitedFilter:
-    """Return the filter of a plant with limits from `base`, the filter of the plant without limits."""
-    start = first(plant)
+    """Return the filter of a plant with limits of its states, from `base`, the filter of the plant without limits.
+
+    Its covariance is claimed to be "nominal" at most, not "exact" or an "upper" bound: that earlier states lay within
+    the limits too is not used.
+    """
+    start = first(plant)  # limits do not vary over time
     # A limit has the state's index, the low end and the high end.
     limits = tuple((start.states.index(name), low, high) for name, (low, high) in start.limits)
     claim: Claim = weakest([base.claim, "nominal"])
     limited = LimitedFilter(base=base, limits=limits, **make_sizes(claim, base, base.received))
-    assumed = base.assumed
+    assumed = base.assumed  # the models for which `base` was made; the plant among them is to be that with limits
     return with_assumed(limited, assumed and assumed.replaced(plant=plant))

@@ -122,7 +122,8 @@ class ToldFilter(AbstractWrapper):
     def knows_law_of_numbers(self) -> bool:
         """True if the law of the numbers that messages report (gains, noise variances) is known.
 
-        Then `expect` averages over that law; else it assumes a typical value for each number.
+        Then `expect` averages over that law; else it assumes a typical value for each number. The link of the first
+        step is asked, since links that vary over time have laws of one kind.
         """
         return has_untold_law(first(self.link))
 
@@ -131,7 +132,8 @@ class ToldFilter(AbstractWrapper):
 
         Reported numbers are not measured. They have the innovation NaN, like missing values, so that no test uses them.
         """
-        received, rows = len(self.values) + len(self.numbers), np.array(self.values)
+        received = len(self.values) + len(self.numbers)
+        rows = np.array(self.values)
         value = jnp.full(received, jnp.nan).at[rows].set(innovation.value)
         covariance = jnp.full((received, received), jnp.nan)
         covariance = covariance.at[rows[:, None], rows].set(innovation.covariance)
@@ -215,14 +217,16 @@ class ToldFilter(AbstractWrapper):
         return jnp.concatenate([jnp.full(part.memory.announced, part.optional) for part in maps])
 
     def _make_filter_given(self, numbers: jax.Array, k: Step) -> tuple[AbstractFilter, jax.Array]:
-        """Build the filter of the law that the reported numbers (numbers,) give to the link, and check that law.
+        """Build the filter for the link z = G y + n with the law that one message's reported numbers give it.
 
-        A number that is needed but missing is replaced by its typical value, so that the filter can be built; the
-        values that need it are not used anyway.
+        The numbers (numbers,) are, for example, the present gain and noise variance. They are NaN where the message
+        lacks them. A number without which the law is not known is then replaced by its typical value (an example), so
+        that the filter can be built; the measured values that need it are not used (`_split_message`).
 
         Returns the filter, and whether the numbers give a law: a negative variance, for example, gives none.
         """
-        link = at(self.link, k)
+        link = at(self.link, k)  # at step k
+        # Typical numbers of all parts of the link with reported numbers ("told maps"), in the order of `numbers`.
         typical = jnp.concatenate([jnp.asarray(affine.typical) for affine in list_told_maps(link)])
         complete_numbers = jnp.where(jnp.isnan(numbers) & ~self._may_be_missing, typical, numbers)
         link_of_law = condition_on_told_numbers(link, complete_numbers)

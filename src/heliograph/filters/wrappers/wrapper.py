@@ -40,12 +40,12 @@ class AbstractWrapper(AbstractSizedFilter):
 
     @predicts
     def predict(self, state: PyTree, u: ArrayLike = (), k: Step = 0) -> PyTree:
-        """Predict with the base filter."""
+        """Predict over step k with the inputs u, by the base filter."""
         return self.base.predict(state, u, k)
 
     @corrects
     def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
-        """Correct with the base filter."""
+        """Correct with the measurement z of step k, by the base filter."""
         return self.base.correct(state, z, k)
 
     @estimates
@@ -84,5 +84,6 @@ class AbstractWrapper(AbstractSizedFilter):
     def _restrict_to_first_states(self, whole: Estimate) -> Estimate:
         """Return mean and covariance of the first states, under this filter's own claim."""
         n = len(self.states)
-        mean, covariance = whole.mean[..., :n], whole.covariance[..., :n, :n]
+        mean = whole.mean[..., :n]
+        covariance = whole.covariance[..., :n, :n]
         return replace(whole, mean=mean, covariance=covariance, claim=self.claim, attitude=self.attitude)

@@ -14,17 +14,17 @@ class GraphLike(Protocol):
     """A graph as networkx has it: `edges()` yields pairs of names, sender first where it `is_directed()`."""
 
     def edges(self) -> Iterable[Any]:
-        """Return the pairs of names."""
+        """Return the edges as pairs of node names, sender first if the graph is directed."""
 
     def nodes(self) -> Iterable[Any]:
         """Return the names of the nodes."""
 
     def is_directed(self) -> bool:
-        """Test whether a pair is one way."""
+        """Return whether an edge leads one way only, from its first node to its second."""
 
 
-FEW = 64  # nodes whose rows stay together
-PARTS = (0.4, 0.75, 0.95, 1.0)  # shares of the nodes up to the longest row of each part
+FEW = 64  # up to so many nodes the rows are not divided
+PARTS = (0.4, 0.75, 0.95, 1.0)  # quantiles of the numbers of neighbours at which the rows are divided
 Neighbours = Mapping[str, Sequence[str]] | GraphLike
 
 
@@ -42,18 +42,19 @@ class Graph(NamedTuple):
 
     @property
     def edges(self) -> Int[np.ndarray, "edge 2"]:
-        """Places of sender and receiver of every edge, receiver after receiver; a node itself is none."""
-        receiver, column = np.nonzero(self.present[:, 1:])
-        return np.stack([self.senders[receiver, column + 1], receiver], axis=1)
+        """Indices (sender, receiver) of every edge, sorted by receiver; a node's own entry is no edge."""
+        receiver, column = np.nonzero(self.present[:, 1:])  # column 0 is the node itself
+        sender = self.senders[receiver, column + 1]
+        return np.stack([sender, receiver], axis=1)
 
     def buckets(self) -> "list[Graph]":
-        """Return parts of the rows, those with few neighbours first, without padding that they do not need.
+        """Return the rows divided by their numbers of neighbours, those with few first, with less padding.
 
-        Arithmetic on a row costs up to the cube of its length, and a graph has few long rows. Up to FEW (64) nodes stay
-        together. PARTS: the shares of nodes up to the longest row of each part.
+        Arithmetic on a row costs up to the cube of its padded length, and a graph has few long rows. The longest row of
+        each part is at one of the quantiles PARTS. A graph of up to FEW nodes stays as it is.
         """
-        counts = self.present.sum(axis=1)
-        widths = {counts.max()}
+        counts = self.present.sum(axis=1)  # of neighbours, the node itself included
+        widths = {counts.max()}  # padded lengths of the parts' rows
         if len(counts) > FEW:
             widths = {int(width) for width in np.quantile(counts, PARTS, method="higher")}
         parts, width_before = [], 0

@@ -94,7 +94,8 @@ def propagate_joint_covariance(
     measured = weighted_information @ weights.T
     # Sparse matrices, outside of a program, are made dense before they are added.
     measured = measured if is_traced(measured) else measured.toarray()
-    # F Q F' + W S W', then M J M' plus that; symmetric, as rounding leaves it only nearly.
+    # F Q F' + W S W', with the F_i one below the other, (N, n); then M J M' plus that. (`propagate_by_mode(A, P, Q)` is
+    # A P A' + Q.) The result is made symmetric, as rounding leaves it only nearly.
     added = propagate_by_mode(correction_map.reshape(len(joint), -1), process_noise, measured)
     after = propagate_by_mode(transition, joint, added)
     symmetric: Float[Array, "N N"] = (after + after.T) / 2
@@ -102,6 +103,9 @@ def propagate_joint_covariance(
 
 
 def blocks_of(joint: Float[Array, "node n node n"], senders: Int[Array, "node degree"]) -> Float[Array, "..."]:
-    """Return the joint covariance of each node and its neighbours, (node, degree, n, degree, n)."""
+    """Return the joint covariance of each node and its neighbours, (node, degree, n, degree, n).
+
+    It is the part of `joint`, that of all nodes, with the rows and columns of the nodes in a row of `senders`.
+    """
     blocks: Float[Array, "..."] = joint[senders[:, :, None], :, senders[:, None], :].swapaxes(2, 3)
     return blocks

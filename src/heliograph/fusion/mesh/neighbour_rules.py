@@ -69,7 +69,7 @@ class TraceIntersection(AbstractIntersection):
         return shares
 
     def neighbour_weights(self, believed: NeighbourEstimates) -> NeighbourWeights:
-        """Find the weights by which a node intersects what arrived from its neighbours."""
+        """Return the weights of covariance intersection, with shares by the traces, of the estimates that arrived."""
         return intersection_weights(believed, choose_shares_by_trace(believed, self.power, self.improvements))
 
 
@@ -77,15 +77,15 @@ class _NeighbourRule(AbstractFusion):
     """Rule that fuses estimates of neighbours only, not at a fusion centre."""
 
     def claim(self, claims: list[Claim]) -> Claim:
-        """Refuse: a fusion centre has no neighbours."""
+        """Raise ValueError: the rule is for neighbours, and a fusion centre has none."""
         raise self._refuse_without_neighbours()
 
     def combine(self, means: Means, covariances: Covariances) -> Fused:
-        """Refuse: a fusion centre has no neighbours."""
+        """Raise ValueError: the rule is for neighbours, and a fusion centre has none."""
         raise self._refuse_without_neighbours()
 
     def _refuse_without_neighbours(self) -> InputError:
-        """Make the ValueError of such a rule at a fusion centre."""
+        """Return the error that the rule is used at a fusion centre, where it needs neighbours."""
         return fail(f"fusion by {type(self).__name__}", "neighbours (Fusion(..., neighbours=...))", "a fusion centre")
 
 
@@ -122,7 +122,7 @@ class DiffusionWeights(_NeighbourRule):
 
     @property
     def needs_joint(self) -> bool:
-        """Always True: the claim is the joint covariance's."""
+        """Always True: the fixed shares do not need it, but the errors' covariance comes from it."""
         return True
 
     def placed(self, graph: Graph) -> "DiffusionWeights":
@@ -148,10 +148,11 @@ class DiffusionWeights(_NeighbourRule):
         return placed
 
     def neighbour_gains(self, believed: NeighbourEstimates, step: NodeStep) -> NodeGains:
-        """Return the gains of a filter with all neighbours' measurements; an estimate's gain has its share, or is zero.
+        """Return the gains of one node: M_ij = (I - P S) A c_ij of neighbour j's estimate, and P of the measurements.
 
-        Gains do not depend on what arrives: P = (Pb^-1 + S)^-1 with the information S = `step.complete` of all
-        measurements. Only those that arrived correct, with the information `step.arrived`.
+        They are those of a filter that receives all its neighbours' measurements, whatever arrives: with the predicted
+        covariance Pb and the information S = `step.complete`, P = (Pb^-1 + S)^-1. An estimate that did not arrive gets
+        the gain 0. The measurements that arrived have the information `step.arrived`.
         """
         a = jnp.asarray(step.matrix)
         predicted = symmetrize(a @ believed.covariance @ a.T + step.noise)
@@ -207,7 +208,8 @@ class FrozenWeights(_NeighbourRule):
         covariances of each node and its neighbours, nodes along the last axis). So all steps of a node are computed
         at once, and its block is read once.
         """
-        blocks_by_row, arrived_by_row = np.moveaxis(np.asarray(self.blocks), -1, 0), np.swapaxes(arrived, 0, 1)
+        blocks_by_row = np.moveaxis(np.asarray(self.blocks), -1, 0)
+        arrived_by_row = np.swapaxes(arrived, 0, 1)
         with jax.enable_x64(True):
             # The native code runs once for each row, as it does elsewhere for each run; the rule is the same in all.
             choice = choose_code(

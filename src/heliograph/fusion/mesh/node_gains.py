@@ -110,9 +110,9 @@ def correct_by_information(
 def information_of(
     gain: jax.Array, noise: jax.Array, used: jax.Array
 ) -> tuple[Float[jax.Array, "n m"], Float[jax.Array, "n n"]]:
-    """Return H' R^-1 and H' R^-1 H of the components that are used.
+    """Return H' R^-1 (n, m) and the information H' R^-1 H (n, n) of a measurement z = H x + v, R = Cov v.
 
-    z = H x + v of m components, R = Cov v.
+    Only the components of z that are `used`, such as those that arrived, count.
 
     Args:
         gain: H (m, n).
@@ -120,7 +120,7 @@ def information_of(
         used: True where a component is used (m,).
     """
     mask = used.astype(gain.dtype)
-    # Components that are not used have rows of zeros in H, and noise of their own.
+    # Components that are not used get rows of zeros in H, and independent noise of variance 1.
     h = mask[:, None] * gain
     r = mask[:, None] * noise * mask[None] + jnp.diag(1 - mask)
     weighted = psd_solve(r, h).T

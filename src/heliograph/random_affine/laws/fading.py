@@ -23,23 +23,23 @@ class Rayleigh(AbstractLaw):
         self.scale = scalar("Rayleigh scale", scale, low=0.0)
 
     def sample(self, key: jax.Array) -> jax.Array:
-        """Draw scale * sqrt(-2 log u)."""
+        """Draw a gain, scale sqrt(-2 log u) with u uniform in (0, 1)."""
         return jax.random.rayleigh(key, jnp.asarray(self.scale), dtype=float)
 
     def moment(self, order: int) -> float | jax.Array:
-        """Return scale^k 2^(k/2) Gamma(1 + k/2)."""
+        """Return E[g^k] = scale^k 2^(k/2) Gamma(1 + k/2), k = `order`."""
         return plain((self.scale * np.sqrt(2)) ** order * gamma(1 + order / 2))
 
     def quantile(self, probability: Vector) -> np.ndarray:
-        """Return scale sqrt(-2 log(1 - p))."""
+        """Return the gains scale sqrt(-2 log(1 - p)) at which the distribution function has the values p."""
         return np.asarray(np.sqrt(-2 * np.log1p(-probability)) * float(self.scale))
 
     def log_density(self, g: jax.Array) -> jax.Array:
-        """Return log(g) - g^2 / (2 scale^2)."""
+        """Return log(g) - g^2 / (2 scale^2), the logarithm of the density up to a constant."""
         return jnp.log(g) - jnp.square(g / self.scale) / 2
 
     def bulk(self) -> tuple[Scalar | float, Scalar | float]:
-        """Return the interval that holds nearly all of the law: from 0 to 9 scales."""
+        """Return the interval (0, 9 scales) of gains, which holds all of the law but a share of e^-40."""
         return 0.0, 9 * self.scale
 
 
@@ -55,17 +55,20 @@ class Rician(AbstractLaw):
         self.scale = scalar("Rician scale", scale, np.finfo(float).tiny)
 
     def sample(self, key: jax.Array) -> jax.Array:
-        """Draw the length of (sight + scale n1, scale n2)."""
+        """Draw a gain: the length of (sight + scale n1, scale n2), n1 and n2 of N(0, 1)."""
         parts = jax.random.normal(key, (2,), dtype=float) * self.scale
         return jnp.hypot(self.sight + parts[0], parts[1])
 
     def moment(self, order: int) -> float | jax.Array:
-        """Return scale^k 2^(k/2) Gamma(1 + k/2) L_(k/2)(-sight^2 / (2 scale^2)), L the Laguerre function."""
+        """Return E[g^k] = scale^k 2^(k/2) Gamma(1 + k/2) L_(k/2)(-x), x = (sight / scale)^2 / 2, L Laguerre's."""
         shape = _evaluate_half_order_laguerre(order, ((self.sight / self.scale) ** 2) / 2)
         return plain((self.scale * np.sqrt(2)) ** order * gamma(1 + order / 2) * shape)
 
     def quantile(self, probability: Vector) -> np.ndarray:
-        """Return scale sqrt of the quantile of the noncentral chi-squared law of 2 degrees."""
+        """Return the gains at which the distribution function has these values.
+
+        (g / scale)^2 is noncentral chi-squared with 2 degrees of freedom and noncentrality (sight / scale)^2.
+        """
         squared = scipy.special.chndtrix(probability, 2, (float(self.sight) / float(self.scale)) ** 2)
         return np.asarray(np.sqrt(squared) * float(self.scale))
 
@@ -75,14 +78,16 @@ class Rician(AbstractLaw):
         It is log(g) - (g - sight)^2 / (2 scale^2) + log(e^-x I_0(x)) with x = g sight / scale^2. `sight` is the gain of
         the direct path.
         """
-        sight, scale = jnp.asarray(self.sight), jnp.asarray(self.scale)
+        sight = jnp.asarray(self.sight)
+        scale = jnp.asarray(self.scale)
         bessel = jax.scipy.special.i0e(g * sight / scale**2)
         return jnp.log(g) - jnp.square((g - sight) / scale) / 2 + jnp.log(bessel)
 
     def bulk(self) -> tuple[Scalar | float, Scalar | float]:
-        """Return the interval that holds nearly all of the law: within 9 scales of the line of sight."""
+        """Return the interval of gains within 9 scales of the line of sight, at least 0: nearly all of the law."""
         reach = 9 * self.scale
-        return library(self.sight, self.scale).maximum(self.sight - reach, 0.0), self.sight + reach
+        xp = library(self.sight, self.scale)  # NumPy, or JAX for traced parameters
+        return xp.maximum(self.sight - reach, 0.0), self.sight + reach
 
 
 def _evaluate_half_order_laguerre(twice_order: int, x: Scalar) -> Scalar:
@@ -133,7 +138,7 @@ class Nakagami(AbstractLaw):
         return np.asarray(np.sqrt(squares))
 
     def log_density(self, g: jax.Array) -> jax.Array:
-        """Return (2 m - 1) log(g) - m g^2 / power."""
+        """Return (2 m - 1) log(g) - m g^2 / power, the logarithm of the density up to a constant; m is `shape`."""
         m = jnp.asarray(self.shape)
         return (2 * m - 1) * jnp.log(g) - m * jnp.square(g) / self.power
 
@@ -160,29 +165,29 @@ class LogNormal(AbstractLaw):
         self.log_deviation = scalar("log-normal deviation", log_deviation, low=0.0)
 
     def sample(self, key: jax.Array) -> jax.Array:
-        """Draw exp(log_mean + log_deviation n)."""
+        """Draw a gain, exp(log_mean + log_deviation n) with n of N(0, 1)."""
         return jnp.exp(self.log_mean + self.log_deviation * jax.random.normal(key, dtype=float))
 
     def moment(self, order: int) -> float | jax.Array:
-        """Return exp(k mu + k^2 sigma^2 / 2)."""
+        """Return E[g^k] = exp(k mu + k^2 sigma^2 / 2), k = `order`, for log g of N(mu, sigma^2)."""
         exponent = order * self.log_mean + (order * self.log_deviation) ** 2 / 2
         return plain(library(exponent).exp(exponent))
 
     def quantile(self, probability: Vector) -> np.ndarray:
-        """Return exp(log_mean + log_deviation t) with t the normal quantile."""
+        """Return the gains exp(log_mean + log_deviation t) at these probabilities, t the quantiles of N(0, 1)."""
         return np.asarray(np.exp(float(self.log_mean) + float(self.log_deviation) * scipy.special.ndtri(probability)))
 
     @property
     def logarithmic(self) -> bool:
-        """Always True."""
+        """Always True: the gain is positive, and its logarithm is what is spread evenly."""
         return True
 
     def log_density(self, g: jax.Array) -> jax.Array:
-        """Return -log(g) - (log(g) - log_mean)^2 / (2 log_deviation^2)."""
+        """Return -log(g) - (log(g) - log_mean)^2 / (2 log_deviation^2), the log density up to a constant."""
         return -jnp.log(g) - jnp.square((jnp.log(g) - self.log_mean) / self.log_deviation) / 2
 
     def bulk(self) -> tuple[Scalar | float, Scalar | float]:
-        """Return the interval that holds nearly all of the law: within 9 deviations of the gain's logarithm."""
+        """Return the gains (low, high) at 9 deviations of log g below and above its mean: nearly all of the law."""
         xp = library(self.log_mean, self.log_deviation)
         reach = 9 * self.log_deviation
         return xp.exp(self.log_mean - reach), xp.exp(self.log_mean + reach)

@@ -11,9 +11,9 @@ from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.types import Array, Float
 from heliograph.random_affine.laws.law import AbstractLaw, Constant, Discrete
 
-GAINS, ERRORS = 96, 24  # nodes of a gain, and of the error of its reading
-NODES = 64  # of Gauss-Legendre, over all that matters of the posterior
-NATS = 36.0  # below its mode, where a density no longer counts: e^-36 is a rounding error
+GAINS, ERRORS = 96, 24  # quadrature nodes for means over a gain, and over the error of its reading
+NODES = 64  # Gauss-Legendre nodes over all that matters of the posterior density
+NATS = 36.0  # a density that is less than e^-36 of its largest value does not count: that is a rounding error
 GRID = 33  # points among which the mode, and then each end, is looked for
 ZOOMS = 12  # times that the grid shrinks to two of its cells: by (2 / 32)^12, to the last bit
 
@@ -96,11 +96,11 @@ def _integrate_posterior(law: AbstractLaw, a: jax.Array, variance: jax.Array) ->
     deviation = jnp.sqrt(variance)
 
     def to_gain(t: jax.Array) -> jax.Array:
-        """Return the gain g at t."""
+        """Return the gain g of the variable of integration t: e^t for a law over orders of magnitude, else t^4."""
         return jnp.exp(t) if law.logarithmic else t**4
 
     def from_gain(g: Float[Array, ""]) -> jax.Array:
-        """Return the t of a gain, of a negative one that of 0."""
+        """Return t of a gain, the inverse of `to_gain`; a negative gain counts as 0."""
         return jnp.log(jnp.maximum(g, np.finfo(float).tiny)) if law.logarithmic else jnp.maximum(g, 0.0) ** 0.25
 
     def log_density(t: jax.Array) -> jax.Array:
@@ -135,7 +135,10 @@ LogDensity = Callable[[jax.Array], jax.Array]
 
 
 def _find_density_mode(log_density: LogDensity, low: jax.Array, high: jax.Array) -> jax.Array:
-    """Return where a density with one mode in [low, high] is largest, by ZOOMS grids of GRID points, each finer."""
+    """Return where a density with one mode in [low, high] is largest.
+
+    The interval is replaced ZOOMS times by the two cells beside the largest of GRID points in it.
+    """
     steps = np.linspace(0.0, 1.0, GRID)
 
     def zoom(_: int, ends: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:

@@ -30,8 +30,9 @@ CORNER_LIMIT = 12  # atoms whose corners are listed; above, moments are bounded 
 
 
 def draw_index(probabilities: Vector, key: jax.Array) -> jax.Array:
-    """Draw one of finitely many: invert the distribution function at a uniform draw."""
-    return jnp.sum(jax.random.uniform(key, dtype=float) > jnp.cumsum(jnp.asarray(probabilities))[:-1])
+    """Draw an index i with P(i) = probabilities[i]: invert the distribution function at a uniform draw."""
+    ends_of_intervals = jnp.cumsum(jnp.asarray(probabilities))[:-1]  # without the last, which is 1
+    return jnp.sum(jax.random.uniform(key, dtype=float) > ends_of_intervals)
 
 
 @readable
@@ -45,7 +46,7 @@ class AbstractLaw(Module):
 
     @property
     def constant(self) -> Scalar | None:
-        """The gain where it is one number; None where it is random."""
+        """The value of a gain that is not random; by default None, for a random gain."""
         return None
 
     def sample(self, key: jax.Array) -> jax.Array:
@@ -53,11 +54,14 @@ class AbstractLaw(Module):
         raise unwritten(self, "sample")
 
     def moment(self, order: int) -> float | jax.Array:
-        """Return E[g^order] under the nominal law; traced where the law's parameters are."""
+        """Return E[g^order] under the nominal law; a JAX tracer if the law's parameters are traced."""
         raise unwritten(self, "moment")
 
     def extremes(self) -> tuple["AbstractLaw", ...]:
-        """Return the extreme laws, vertices ("corners") of the set of possible laws; itself alone when it is known."""
+        """Return the laws at the vertices ("corners") of the polytope of possible probabilities; (self,) if known.
+
+        Any expectation is linear in the probabilities, so that its largest value is at one of them.
+        """
         return (self,)
 
     def corner_moments(self, order: int) -> Float[jax.Array | np.ndarray, "corner order+1"]:
@@ -74,7 +78,10 @@ class AbstractLaw(Module):
         return are_same(self, actual)
 
     def list_atoms(self) -> list[tuple[float | jax.Array, float | jax.Array]]:
-        """Return probability and value of each of finitely many gains; by default a refusal."""
+        """Return (probability, value) of each value that the gain may have, if these are finitely many.
+
+        A mixture filter has a Gaussian for each. By default raise ValueError: the law is continuous.
+        """
         raise fail("mixture filter", "gains of finitely many values", type(self).__name__)
 
     def quantile(self, probability: Vector) -> np.ndarray:
@@ -87,21 +94,22 @@ class AbstractLaw(Module):
 
     @in_float64
     def _draw_sample_of_gains(self) -> np.ndarray:
-        """Draw DRAWS gains."""
-        values: np.ndarray = np.asarray(jax.vmap(self.sample)(jax.random.split(jax.random.key(0), DRAWS)))
+        """Draw DRAWS gains (DRAWS,) by a fixed seed, for quantiles of a law that has no formula for them."""
+        keys = jax.random.split(jax.random.key(0), DRAWS)
+        values: np.ndarray = np.asarray(jax.vmap(self.sample)(keys))
         return values
 
     @property
     def logarithmic(self) -> bool:
-        """True of a positive gain whose law is wide on a logarithmic scale."""
+        """True if the gain is positive and spreads over orders of magnitude: integrals are then taken over log g."""
         return False
 
     def log_density(self, g: jax.Array) -> jax.Array:
-        """Return log p(g) but for a constant, of a positive gain that has a density."""
+        """Return log p(g) + const, for a positive gain g with the density p."""
         raise unwritten(self, "log_density")
 
     def bulk(self) -> "tuple[Scalar | float, Scalar | float]":
-        """Return gains between which all of the law lies but a share of e^-36."""
+        """Return an interval (low, high) of gains outside of which the gain is with a probability of e^-36 at most."""
         raise unwritten(self, "bulk")
 
     def mean_law(self) -> "Constant":
@@ -123,7 +131,7 @@ class Constant(AbstractLaw):
 
     @property
     def constant(self) -> Scalar:
-        """The one value that the gain has."""
+        """The gain, which is not random: `value`. A law that is random has None here."""
         return self.value
 
     def sample(self, key: jax.Array) -> jax.Array:
@@ -131,11 +139,11 @@ class Constant(AbstractLaw):
         return jnp.asarray(self.value)
 
     def moment(self, order: int) -> float | jax.Array:
-        """Return value^order."""
+        """Return E[g^order] = value^order."""
         return plain(self.value**order)
 
     def list_atoms(self) -> list[tuple[float | jax.Array, float | jax.Array]]:
-        """Return the value, which is certain."""
+        """Return the only (probability, value) pair: (1, value)."""
         return [(1.0, plain(self.value))]
 
 
@@ -157,7 +165,7 @@ class Discrete(AbstractLaw):
         return jnp.asarray(self.values)[draw_index(self.probabilities, key)]
 
     def moment(self, order: int) -> float | jax.Array:
-        """Return sum_i p_i v_i^order."""
+        """Return E[g^order] = sum_i p_i v_i^order, with the nominal probabilities p."""
         return plain(self.probabilities @ self.values**order)
 
     def moment_interval(self, order: int) -> tuple[float | jax.Array, float | jax.Array]:
@@ -183,7 +191,7 @@ class Discrete(AbstractLaw):
         return within(actual.probabilities, actual.radius, self.probabilities, self.radius)
 
     def list_atoms(self) -> list[tuple[float | jax.Array, float | jax.Array]]:
-        """Return the values, with their probabilities."""
+        """Return (probability, value) of each value, with the nominal probabilities."""
         return [(plain(p), plain(v)) for p, v in zip(self.probabilities, self.values, strict=True)]
 
     def worst(self, payoff: ArrayLike) -> float:
@@ -203,7 +211,7 @@ class Discrete(AbstractLaw):
         return total
 
     def extremes(self) -> tuple[AbstractLaw, ...]:
-        """Return the laws at all corners of the polytope.
+        """Return the laws at all vertices ("corners") of the polytope of possible probabilities.
 
         Raises:
             ValueError: more than CORNER_LIMIT uncertain atoms, whose corners are too many to list.
@@ -211,9 +219,10 @@ class Discrete(AbstractLaw):
         return tuple(Discrete(self.values, corner) for corner in self.corners())
 
     def corner_moments(self, order: int) -> Float[jax.Array | np.ndarray, "corner order+1"]:
-        """Return E[g^k], k = 0, ..., order, of each of the `extremes`."""
+        """Return E[g^k] = sum_i p_i v_i^k at [corner, k], k = 0, ..., order, for the p of each of the `corners`."""
         corners = self.corners()
-        return stack_parts([corners @ self.values**k for k in range(order + 1)]).T
+        moments_by_order = [corners @ self.values**k for k in range(order + 1)]
+        return stack_parts(moments_by_order).T
 
     @cache_by_object
     def corners(self) -> Float[jax.Array | np.ndarray, "corner atom"]:
@@ -253,7 +262,9 @@ class Discrete(AbstractLaw):
 
 
 class CertainDiscrete(Discrete):
-    """Gains of finitely many values whose probabilities are certain, also where all numbers are traced.
+    """Gains of finitely many values whose probabilities are certain, even if JAX traces all numbers.
+
+    Its only corner is known without a look at `radius`, which a traced law could not decide on.
 
     Raises:
         ValueError: a law whose probabilities may be off.
@@ -266,7 +277,7 @@ class CertainDiscrete(Discrete):
         self.values, self.probabilities, self.radius = law.values, law.probabilities, law.radius
 
     def corners(self) -> Float[jax.Array | np.ndarray, "corner atom"]:
-        """Return the probabilities alone."""
+        """Return the only possible probabilities, shape (1, values)."""
         return self.probabilities[None]
 
 
@@ -300,7 +311,10 @@ class GivenMoments(AbstractLaw):
     moments: Vector
 
     def __init__(self, moments: "Float[ArrayLike, ' order']"):
-        """Hold E[g], E[g^2], ...; raise ValueError unless some distribution may have these moments."""
+        """Hold E[g], E[g^2], ...; raise ValueError unless some distribution may have these moments.
+
+        A distribution has them only if its Hankel matrix, of the entries E[g^(i + j)], is positive semidefinite.
+        """
         self.moments = array("gain moments", moments, (None,))
         if is_traced(self.moments):  # numbers that are not known yet cannot be checked
             return

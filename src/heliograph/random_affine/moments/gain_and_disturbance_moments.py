@@ -120,7 +120,8 @@ def _place_columns(gain: DisturbedGain, shared: int, gains: Sequence[DisturbedGa
     start = shared + sum(private_widths[:index])
     columns = [*range(shared), *range(start, start + private_widths[index])]
     m, total = gain.mean.shape[0], shared + sum(private_widths)
-    mean, second = np.zeros((m, total)), np.zeros((m, total, m, total))
+    mean = np.zeros((m, total))
+    second = np.zeros((m, total, m, total))
     mean[:, columns] = gain.mean
     second[np.ix_(range(m), columns, range(m), columns)] = gain.second
     return DisturbedGain(mean, second, shared)

@@ -13,18 +13,21 @@ def split_off_noise(covariance: Tensor, factor: Any = columns_with_derivatives) 
     """Return the covariances of a random gain A alone, and m columns of Cov n, from those of (A, n).
 
     `covariance` (m, m, p + 1, p + 1) has at [i, j] the covariance of the rows i and j of (A, n), with n last. If A and
-    n are correlated, nothing is split: they are returned as they are, with columns of zeros. `factor` is for Cov n.
+    n are correlated, nothing is split: they are returned as they are, with columns of zeros. `factor` is the function
+    that returns columns B and weights w of a covariance, B diag(w) B' = Cov n.
     """
-    xp, noise_covariance = library(covariance), covariance[..., -1, -1]
-    uncorrelated = xp.all(covariance[..., :-1, -1] == 0)
+    xp = library(covariance)
+    noise_covariance = covariance[..., -1, -1]
+    uncorrelated = xp.all(covariance[..., :-1, -1] == 0)  # Cov(A_ia, n_j)
     removed = xp.where(uncorrelated, noise_covariance, 0.0)
     noise = pad_columns(factor(removed))  # m columns, some of them zero if the covariance has fewer
     return covariance - removed[..., None, None] * make_power_of_constant(covariance.shape[-1]), noise
 
 
 def pad_columns(noise: WeightedColumns) -> WeightedColumns:
-    """Return the columns of a covariance, with columns of zeros to as many as it has rows."""
-    xp, lacking = library(noise), len(noise.matrix) - noise.matrix.shape[1]
+    """Return the m x k factor of a covariance, k <= m, with columns of zeros appended, so that it is m x m."""
+    xp = library(noise)
+    lacking = len(noise.matrix) - noise.matrix.shape[1]
     return WeightedColumns(xp.pad(noise.matrix, ((0, 0), (0, lacking))), xp.pad(noise.weights, (0, lacking)))
 
 

@@ -23,7 +23,8 @@ def multiply_matrices(second: Interval, first: Interval) -> Interval:
     c2, r2 = (high2 + low2) / 2, (high2 - low2) / 2
     c1, r1 = (high1 + low1) / 2, (high1 - low1) / 2
     absolute = library(c1, c2).abs
-    center, radius = c2 @ c1, absolute(c2) @ r1 + r2 @ (absolute(c1) + r1)
+    center = c2 @ c1
+    radius = absolute(c2) @ r1 + r2 @ (absolute(c1) + r1)
     return center - radius, center + radius
 
 

@@ -56,7 +56,7 @@ class NoiseAtom(NamedTuple):
     covariance: Array
 
     def above(self, other: "NoiseAtom") -> "NoiseAtom":
-        """Stack on an independent noise."""
+        """Return this atom of a noise above the `other` one, of an independent noise; probabilities are multiplied."""
         value = _concatenate_first_axis(self.value, other.value)
         return NoiseAtom(self.weight * other.weight, value, block_diagonal([self.covariance, other.covariance]))
 
@@ -78,7 +78,7 @@ def combine_atoms(atoms_by_part: Sequence[list[Atom]], join: Callable[[Atom, Ato
 
 
 def _concatenate_first_axis(a: Array, b: Array) -> Array:
-    """Return b behind a, along the first axis."""
+    """Return the arrays a and b, of NumPy or JAX, joined along the first axis."""
     joined: Array = library(a, b).concatenate([a, b])
     return joined
 
@@ -106,7 +106,8 @@ def stack_branches(parts: Sequence[GaussianBranches]) -> GaussianBranches:
 
     A component is a mixture of Gaussian branches. Branches that are added have the probability 0.
     """
-    xp, largest_count = library(parts), max(law.mean.shape[1] for law in parts)
+    xp = library(parts)
+    largest_count = max(law.mean.shape[1] for law in parts)
     padding_values = (-np.inf, 0.0, 1.0)  # log of the probability 0, mean 0 and variance 1
 
     def padded(law: GaussianBranches) -> list[Array]:

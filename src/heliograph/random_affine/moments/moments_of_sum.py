@@ -49,12 +49,14 @@ def expand_map_moments(matrix: Corners, outputs: int, components: Components, or
         components: indices in y of y_c, in any order. The polynomials returned have them in increasing order.
         order: order of the moments.
     """
-    ordered, variables = tuple(sorted(components)), len(components) + 1
+    ordered = tuple(sorted(components))
+    variables = len(components) + 1
     # For each variable of H, its number in the increasing order; the constant 1 is last in both.
     sorted_variable = np.array([ordered.index(i) for i in components] + [len(components)])
     by_degree = [library(matrix).ones((len(matrix), 1, 1))]
     for degree in range(1, order + 1):
-        rows, columns = find_monomials_of_degree(outputs, degree, order), times_one(variables, degree, order)
+        rows = find_monomials_of_degree(outputs, degree, order)
+        columns = times_one(variables, degree, order)
         # Column j of H's order goes to the position of monomial j in the increasing order; argsort inverts this.
         new_positions = place_monomials(sorted_variable[factor_variables(variables, degree)], variables)
         by_degree.append(matrix[:, rows[:, None], columns[np.argsort(new_positions)]])
@@ -95,7 +97,8 @@ def add_independent_moments(t: SumMoments, r: SumMoments, outputs: int) -> SumMo
     """
     # Components of y on which t + r depends; with 1 they are the `size` variables of the polynomials.
     components = tuple(sorted({*t.components, *r.components}))
-    size, corners = len(components) + 1, len(t.by_degree[0]) * len(r.by_degree[0])
+    size = len(components) + 1
+    corners = len(t.by_degree[0]) * len(r.by_degree[0])
     # For each polynomial the indices of its own variables among those of both.
     variables_of_t, variables_of_r = (
         (*(components.index(i) for i in summand.components), size - 1) for summand in (t, r)
@@ -134,7 +137,10 @@ class _BinomialTerms(NamedTuple):
 
 @cache_arrays
 def _list_binomial_terms(outputs: int, degree: int) -> tuple[_BinomialTerms, ...]:
-    """Return the terms of (t + r)^c = sum_b C(c, b) t^b r^(c-b), |c| = degree, for each |b| = 0, 1, ..., degree."""
+    """Return the terms of (t + r)^c = sum_b C(c, b) t^b r^(c-b) for all c with |c| = degree, sorted by |b|.
+
+    Entry k of the result has the terms with |b| = k, k = 0, 1, ..., degree. t and r have `outputs` components.
+    """
     exponents = list_exponents(outputs + 1, degree)
     by_degree_of_b: list[list[tuple[int, ...]]] = [[] for _ in range(degree + 1)]
     for c, b, remainder, binomial in zip(*plan_binomial_sums(outputs, degree), strict=True):
@@ -174,7 +180,8 @@ def assemble_moments(moments: SumMoments, outputs: int, inputs: int, order: int)
         inputs: length of y.
         order: order of the moments.
     """
-    size, corners = len(moments.components) + 1, len(moments.by_degree[0])
+    size = len(moments.components) + 1
+    corners = len(moments.by_degree[0])
     # Indices of the polynomials' variables in (y, 1); 1 is the last one, number `inputs`.
     variables = np.array([*moments.components, inputs])
     xp = library(moments.by_degree)

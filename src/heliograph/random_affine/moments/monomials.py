@@ -23,7 +23,7 @@ from heliograph.numerics.types import Float
 MEMORY_LIMIT_ENTRIES = 50_000_000  # 400 MB of float64: more is refused with the number
 
 Exponents = tuple[int, ...]
-Numbers = Any  # NumPy's or JAX's, or a list of such
+Numbers = Any  # an array of NumPy or JAX, or a list of numbers
 
 
 @cache
@@ -44,7 +44,7 @@ def list_exponents(variables: int, degree: int) -> tuple[Exponents, ...]:
 
 @cache
 def position(variables: int, degree: int) -> dict[Exponents, int]:
-    """Return the position of each monomial in `list_exponents`."""
+    """Return the position of each monomial in `list_exponents(variables, degree)`, by its exponents."""
     return {powers: i for i, powers in enumerate(list_exponents(variables, degree))}
 
 
@@ -163,7 +163,8 @@ def product_table(variables: int, first: int, second: int) -> np.ndarray:
 
     Monomial i has the degree `first`, and j has the degree `second`.
     """
-    a, b = factor_variables(variables, first), factor_variables(variables, second)
+    a = factor_variables(variables, first)
+    b = factor_variables(variables, second)
     shape = len(a), len(b)
     of_a = np.broadcast_to(a[:, None], (*shape, first))
     of_b = np.broadcast_to(b, (*shape, second))
@@ -181,7 +182,10 @@ def multiply_polynomials(a: Numbers, first: int, b: Numbers, second: int, variab
 
 
 def multiply_by_linear_form(polynomial: dict[Exponents, Numbers], row: Numbers) -> dict[Exponents, Numbers]:
-    """Return the polynomial p(u) times sum_j row_j u_j; polynomials are coefficients by exponents of u."""
+    """Return p(u) sum_j row_j u_j, a polynomial times a linear form.
+
+    A polynomial is held as the coefficient of each monomial, with the monomial's exponents as key.
+    """
     product: dict[Exponents, Numbers] = {}
     nonzero = [j for j, entry in enumerate(row) if not is_zero(entry)]
     for a, coefficient in polynomial.items():
@@ -193,7 +197,7 @@ def multiply_by_linear_form(polynomial: dict[Exponents, Numbers], row: Numbers) 
 
 @cache_arrays
 def degrees(dimension: int, order: int) -> np.ndarray:
-    """Return the degree of each monomial in the variables other than 1."""
+    """Return the degree |a| of each monomial y^a 1^(order - |a|) of total degree `order`; y has `dimension` numbers."""
     return np.array([order - powers[-1] for powers in list_exponents(dimension + 1, order)])
 
 
@@ -269,7 +273,8 @@ def _place_lower_monomials(outputs: int, inputs: int, high: int, low: int) -> tu
     Row by row these are the positions of the monomials of (z, 1) of degree `low`, times 1^(high - low), among those of
     degree `high`; column by column those of (y, 1).
     """
-    rows, columns = times_one(outputs + 1, low, high), times_one(inputs + 1, low, high)
+    rows = times_one(outputs + 1, low, high)
+    columns = times_one(inputs + 1, low, high)
     return np.ix_(rows, columns)
 
 
@@ -293,7 +298,7 @@ def give_moments(own_method: Callable[[Any, int], Any]) -> Callable[[Any, int], 
 
     @wraps(own_method)
     def moments(channel: Any, order: int) -> JointMoments:
-        """Return the moments of this order, from the `JointMoments` or the matrix that the map's own method returns."""
+        """Return E[Sym^order(H)] of a map as `JointMoments`, where its own method may return the matrix alone."""
         result = own_method(channel, order)
         if isinstance(result, JointMoments):
             return result

@@ -37,9 +37,11 @@ Array2 = Float[jax.Array | np.ndarray, "n m"]
 
 @singledispatch
 def push_moments(channel: AbstractRandomAffine, order: int, moments: Array1) -> Array1:
-    """Return E[mono_order(z)] from E[mono_order(y)], for y independent of the map.
+    """Return all moments of z = G y + n up to `order`, from the same `moments` of y, which is independent of G and n.
 
-    The same numbers as `channel.moments(order).expect(moments)`, which is what a map of no known structure does.
+    They are the means of the monomials of total degree k = `order` in (z, 1), and in (y, 1), in the order of
+    `list_exponents`. Maps of known structure have methods that need less memory; this one, for any other map,
+    multiplies by the matrix E[Sym^k(H)].
 
     Shapes: moments (C(inputs + k, k),) -> (C(outputs + k, k),).
     """
@@ -64,13 +66,13 @@ def _push_through_hop(channel: GainAndNoise, order: int, moments: Array1) -> Arr
 
 @push_moments.register
 def _push_through_series(channel: Series, order: int, moments: Array1) -> Array1:
-    """Return E[mono(z)] behind maps one after another."""
+    """Return the moments of z behind maps in series: from y through the first map, then through the next, and so on."""
     return reduce(lambda m, affine: push_moments(affine, order, m), channel.maps, moments)
 
 
 @push_moments.register
 def _push_through_mixture(channel: Mixture, order: int, moments: Array1) -> Array1:
-    """Return E[mono(z)] behind one of several maps: the mean of theirs."""
+    """Return the moments of z behind a map that is drawn from several: sum_i p_i E_i[mono(z)], p_i their weights."""
     parts = [push_moments(affine, order, moments) for affine in channel.maps]
     return channel.choice.probabilities @ stack_parts(parts)
 
@@ -104,30 +106,44 @@ class TabulatedNoise(AbstractNoise):
     order: int = eqx.field(static=True)
 
     def __init__(self, source: AbstractNoise, order: int):
-        """Compute the table of the noise's moments up to `order`; `source` is the noise itself."""
+        """Compute all moments of the noise `source` up to `order`, and hold them as a table."""
         self.mean, self.covariance, self.source = source.mean, source.covariance, source
-        self.table, self.order = noise_moment_vector(source, order), order
+        self.table = noise_moment_vector(source, order)
+        self.order = order
 
     def sample(self, key: jax.Array) -> jax.Array:
-        """Draw from the law itself."""
+        """Draw a noise vector from the law `source` itself."""
         return self.source.sample(key)
 
     def moment(self, powers: Exponents) -> Number:
-        """Look E[n^a] up."""
-        return plain(self.table[position(len(powers) + 1, self.order)[(*powers, self.order - sum(powers))]])
+        """Look E[n^a] up in the table, for the exponents a = `powers`.
+
+        The table has the monomials of total degree `order` in (n, 1): n^a is there as n^a 1^(order - |a|).
+        """
+        power_of_one = self.order - sum(powers)
+        place = position(len(powers) + 1, self.order)[(*powers, power_of_one)]
+        return plain(self.table[place])
 
 
 @noise_moment_vector.register
 def _read_tabulated_moments(noise: TabulatedNoise, order: int) -> Array1:
-    """Return all moments up to `order` of a noise, out of its table."""
+    """Return all moments of the noise up to `order`, selected from its table of a higher order."""
     return noise.table[_positions_of_lower_order(noise.dimension, order, noise.order)]
 
 
 @cache_arrays
 def _positions_of_lower_order(dimension: int, order: int, above: int) -> np.ndarray:
-    """Return the positions of monomials of total degree `order` in (n, 1) among those of degree `above`."""
-    indices = position(dimension + 1, above)
-    return np.array([indices[(*p[:-1], p[-1] + above - order)] for p in list_exponents(dimension + 1, order)])
+    """Return where a table of moments up to the order `above` has those up to a lower `order`.
+
+    A table of order k holds E[n^a] for each monomial n^a 1^(k - |a|) of total degree k in (n, 1), in the order of
+    `list_exponents`; n has `dimension` numbers. So from one table to the other only the power of 1 grows, by
+    above - order.
+    """
+    position_above = position(dimension + 1, above)
+    positions = []
+    for *a, power_of_one in list_exponents(dimension + 1, order):
+        positions.append(position_above[(*a, power_of_one + above - order)])
+    return np.array(positions)
 
 
 def products_of_monomials(moments: Array1, variables: int, degree: int) -> Array2:

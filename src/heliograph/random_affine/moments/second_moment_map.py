@@ -49,12 +49,12 @@ class QuadraticMap(Module):
 
 
 def _one_unless_positive(value: jax.Array) -> jax.Array:
-    """Return positive numbers as they are, and 1 in place of others: a divisor."""
+    """Return positive numbers as they are and 1 in place of others, for use as a divisor."""
     return jnp.where(value > 0, value, 1.0)
 
 
 def map_of_known_law(tensor: Tensor) -> QuadraticMap:
-    """Return the map W -> T:W of a law that is known, without an uncertain part."""
+    """Return the map W -> T:W, (T:W)_ij = sum_ab T[i, j, a, b] W_ab, of one known law: its radius is zero."""
     return QuadraticMap(tensor, np.zeros(tensor.shape))
 
 
@@ -64,34 +64,37 @@ def signal_of_map(bound: QuadraticMap) -> QuadraticMap:
 
 
 def size_of_map(moment_map: QuadraticMap) -> Any:
-    """Return the root of the trace of the map's upper bound at W = I, sqrt(sum_ia (C + R)_iiaa): one number.
+    """Return the size of a bound, one number: sqrt(sum_ia (C + R)[i, i, a, a]), with C its `center` and R its `radius`.
 
-    C is `center`, and R `radius`. The number weighs bounds of several maps that are added. Any positive weights give a
-    valid bound, so that it has no derivative.
+    This is the root of the trace of the bound at W = I. By it bounds of several maps are weighed when they are added.
+    Any positive weights give a valid bound, so that JAX takes it as constant.
     """
     largest = stop_gradient(moment_map.center + moment_map.radius)
     return library(largest).sqrt(library(largest).einsum("iiaa->", largest))
 
 
 def add_maps(*maps: QuadraticMap) -> QuadraticMap:
-    """Return the sum of maps of second moments."""
+    """Return sum_i Q_i of bounds Q_i (`QuadraticMap`): centers and radii add up."""
     return reduce(lambda a, b: QuadraticMap(a.center + b.center, a.radius + b.radius), maps)
 
 
 def scale_map(moment_map: QuadraticMap, factor: Any) -> QuadraticMap:
-    """Return a map of second moments times a number."""
+    """Return the bound Q (`QuadraticMap`) times a number of at least 0: center and radius are multiplied."""
     return QuadraticMap(factor * moment_map.center, factor * moment_map.radius)
 
 
 def place_on_diagonal(block: QuadraticMap, start: int, outputs: int) -> QuadraticMap:
-    """Return the map of a block of outputs, from `start` on, as a map of all `outputs` that is zero elsewhere."""
-    margin = (start, outputs - start - block.center.shape[0])
-    widths = [margin, margin, (0, 0), (0, 0)]
+    """Return the bound of a part of z as a bound of all of z, which has `outputs` components, with zeros elsewhere.
+
+    The part begins at component `start` of z. A bound has center and radius of shape (m, m, p + 1, p + 1).
+    """
+    before_and_behind = (start, outputs - start - block.center.shape[0])
+    widths = [before_and_behind, before_and_behind, (0, 0), (0, 0)]
     center = library(block.center).pad(block.center, widths)
     radius = library(block.radius).pad(block.radius, widths)
     return QuadraticMap(center, radius)
 
 
 def stop_gradient(value: Matrix) -> Matrix:
-    """Stop the gradient of a number on which a decision depends."""
+    """Return the value as a constant of JAX derivatives: it only chooses weights, units or a branch."""
     return jax.lax.stop_gradient(value) if is_traced(value) else value

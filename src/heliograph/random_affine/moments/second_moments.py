@@ -1,7 +1,6 @@
 """Second moments of a channel, bounded under every possible law."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
@@ -10,7 +9,7 @@ import numpy as np
 from heliograph.factors.covariance_factors import WeightedColumns, columns_of
 from heliograph.numerics.caching import cache_by_object
 from heliograph.numerics.module import Module
-from heliograph.numerics.numpy_or_jax import block_diagonal, is_traced, is_zero, library, scatter, stack_parts
+from heliograph.numerics.numpy_or_jax import block_diagonal, is_traced, library, scatter, stack_parts
 from heliograph.numerics.types import Float
 from heliograph.random_affine.base import AbstractRandomAffine, check_forgets, check_maps, count_corners
 from heliograph.random_affine.moments.gain_and_noise_covariances import (
@@ -19,6 +18,7 @@ from heliograph.random_affine.moments.gain_and_noise_covariances import (
     split_off_noise,
 )
 from heliograph.random_affine.moments.interval_products import CORNERS
+from heliograph.random_affine.moments.moment_bounds_of_sum import MomentBounds, bound_sum
 from heliograph.random_affine.moments.moment_tensors import (
     Matrix,
     Tensor,
@@ -33,7 +33,6 @@ from heliograph.random_affine.moments.second_moment_map import (
     place_on_diagonal,
     scale_map,
     signal_of_map,
-    size_of_map,
 )
 from heliograph.random_affine.moments.uncertain_law_bounds import (
     PROPORTIONAL_TOLERANCE,
@@ -46,13 +45,19 @@ from heliograph.random_affine.sum_of_maps import Superposed
 
 
 class SecondOrder(Module):
-    """Mean and second moments of z = G y + n, nominal where the law is known, dominating where it is not.
+    """Mean and second moments of z = G y + n; where several laws v are possible, bounds that hold for all of them.
 
-    mean_gain, offset: M = E[G] and b = E[n] under the nominal law; spread: E_v[((G - M) y + n - b)(...)']; shift: ((M_v
-    - M) y + b_v - b)(...)'; power: E_v[G y y' G'] (the last row and column of W are ignored). nominal: the spread under
-    the nominal law itself, which is gain_covariance : W + Cov n with the columns `noise` of the latter: apart from the
-    gain, so that a combination of outputs that is free of noise stays free of it. Where gain and noise are correlated,
-    gain_covariance is all and noise zero.
+    mean_gain, offset: M = E[G] and b = E[n] under the nominal law.
+    spread: bound of E_v[((G - M) y + n - b)(...)'], the second moment about the nominal mean.
+    shift: bound of ((M_v - M) y + b_v - b)(...)', which the mean under law v adds to it.
+    power: bound of E_v[G y y' G'] (the last row and column of W are ignored).
+    nominal: the spread under the nominal law itself, gain_covariance : W + Cov n.
+    gain_covariance, noise: its two parts. Cov n = B diag(w) B' is kept as B and w, apart from the gain, so that a
+        combination of outputs without noise stays without noise. If gain and noise are correlated, gain_covariance
+        is all and noise zero.
+    uncertain: True if several laws are possible.
+
+    The four bounds take W = E[(y, 1) (y, 1)'] to a matrix (m, m): see `QuadraticMap` (center and radius).
 
     Shapes: mean_gain (m, p), offset (m,), gain_covariance (m, m, p + 1, p + 1), noise (m, m).
     """
@@ -96,18 +101,27 @@ def describe_second_moments(
 
 
 def has_random_gain(channel: AbstractRandomAffine, described: SecondOrder) -> bool:
-    """Return whether z depends on y by a random or uncertain gain, and not only by a known one.
+    """Return whether the gain G of z = G y + n is random or uncertain, and not a known matrix.
 
-    A law that JAX traces has no numbers to look at. It counts as random unless the channel says that its gain is known.
+    `described` is `second_order(channel)`. A law that JAX traces has no numbers to look at: it counts as random unless
+    the channel says that its gain is known.
     """
-    if described.uncertain or is_traced(described.spread):
-        return described.uncertain or not channel.has_known_gain
-    block = np.abs(described.spread.center[..., :-1, :]) + np.abs(described.spread.radius[..., :-1, :])
-    return bool(np.any(block > 0)) and not channel.has_known_gain
+    if described.uncertain:
+        return True
+    if is_traced(described.spread):
+        return not channel.has_known_gain
+    # Covariances of the entries of G with those of (G, n): the last index on this axis, left out, is that of n.
+    center = described.spread.center[..., :-1, :]
+    radius = described.spread.radius[..., :-1, :]
+    size_of_covariances = np.abs(center) + np.abs(radius)
+    return bool(np.any(size_of_covariances > 0)) and not channel.has_known_gain
 
 
 def has_known_mean(described: SecondOrder) -> bool:
-    """Return whether E[G] and E[n] are equal under all possible laws, up to rounding; False for traced parameters."""
+    """Return whether E[G] and E[n] of z = G y + n are the same under all possible laws, up to rounding.
+
+    The bound `described.shift` of what other means add is then zero. False if parameters are traced by JAX.
+    """
     if is_traced((described.shift, described.mean_gain, described.offset)):
         return False
     largest_gain = np.max(np.abs(described.mean_gain), initial=0.0)
@@ -133,7 +147,8 @@ def second_order(channel: AbstractRandomAffine) -> SecondOrder:
     """
     check_maps("channel of a filter", [channel])
     check_forgets("channel of a filter", channel)
-    bounds, uncertain = _bound_moments(channel), count_corners(channel) != 1
+    bounds = _bound_moments(channel)
+    uncertain = count_corners(channel) != 1
     if uncertain or not channel.has_known_gain:
         return describe_second_moments(*bounds, uncertain)
     # A known gain has Cov G = 0, so the noise of the channel's parts suffices, and no tensor of all outputs is needed.
@@ -148,16 +163,6 @@ def second_order(channel: AbstractRandomAffine) -> SecondOrder:
         noise=pad_columns(columns_of(_noise_covariance(channel))),
         uncertain=uncertain,
     )
-
-
-class MomentBounds(NamedTuple):
-    """Nominal mean of (G, n), bounds of spread, shift and power, and the nominal spread."""
-
-    mean: Matrix
-    spread: QuadraticMap
-    shift: QuadraticMap
-    power: QuadraticMap
-    nominal: QuadraticMap
 
 
 def _bound_moments(channel: AbstractRandomAffine) -> MomentBounds:
@@ -197,7 +202,7 @@ def _take_known_moments(channel: AbstractRandomAffine) -> MomentBounds:
             nominal=spread,
         )
     moments = channel.moments(2)
-    mean = moments.mean[:-1]
+    mean = moments.mean[:-1]  # E[(G, n)]: H without its last row (0, 1)
     covariance, shift, power = tensors_of_law(moments, mean)
     spread = map_of_known_law(_drop_known_gain(channel, covariance))
     return MomentBounds(
@@ -216,9 +221,9 @@ def _bound_uncertain_moments(channel: AbstractRandomAffine, can_list_corners: bo
     `can_list_corners` says whether the extreme laws ("corners") are few enough to be computed one by one.
     """
     if isinstance(channel, Superposed) and not can_list_corners:
-        return _bound_sum(channel, [_bound_moments(affine) for affine in channel.maps])
+        return bound_sum(channel, [_bound_moments(affine) for affine in channel.maps])
     nominal = channel.moments(2)
-    mean = nominal.mean[:-1]
+    mean = nominal.mean[:-1]  # E[(G, n)]: H without its last row (0, 1)
     # Bounds from the blocks of a stack, as maxima over the extreme laws, or from intervals of moments.
     if isinstance(channel, Stack):
         bounds = _bound_stacked_maps(channel)
@@ -251,8 +256,8 @@ def _drop_known_gain(channel: AbstractRandomAffine, spread: Tensor) -> Tensor:
     As differences of moments they have rounding there. `spread` has at [i, j, a, b] that of entries (i, a) and (j, b).
     """
     is_random = ~channel.known_gains
-    gain_varies = np.outer(is_random, np.ones(channel.inputs))
-    varies = np.pad(gain_varies, ((0, 0), (0, 1)), constant_values=1.0)  # noise always varies
+    gain_varies = np.outer(is_random, np.ones(channel.inputs))  # (m, p): 1 for a random entry of G
+    varies = np.pad(gain_varies, ((0, 0), (0, 1)), constant_values=1.0)  # and for the noise, which always varies
     without_rounding: Tensor = library(spread).where(symmetric_product(varies, varies) > 0, spread, 0.0)
     return without_rounding
 
@@ -264,19 +269,17 @@ def _bound_stacked_maps(channel: Stack) -> list[QuadraticMap]:
     different maps, which are independent, it is D_i Y Y' D_j', D_i = E_v[H_i] - M_i, with |D_i| at most the `reach` of
     map i in each entry. A bound has a center, and a radius for each entry.
     """
-    n, mean = channel.outputs, channel.moments(1).mean[:-1]
-    blocks: list[list[QuadraticMap]] = []  # (spread, shift, power) of each part
+    mean = channel.moments(1).mean[:-1]  # E[(G, n)]: H without its last row (0, 1)
+    spreads = list[QuadraticMap]()
+    shifts = list[QuadraticMap]()
+    powers = list[QuadraticMap]()
     reaches = []
-    start = 0  # first output of the part
+    start = 0  # first output of the map
     for affine in channel.maps:
-        stop = start + affine.outputs
-        # Diagonal block, and the largest |E[H_i] - M_i| under any law.
-        moments = second_order(affine)
-        low, high = affine.moment_interval(1)
-        xp = library(low, high, mean)
-        to_high, to_low = high[:-1] - mean[start:stop], low[:-1] - mean[start:stop]
-        reaches.append(xp.maximum(xp.abs(to_high), xp.abs(to_low)))
-        blocks.append([place_on_diagonal(q, start, n) for q in (moments.spread, moments.shift, moments.power)])
+        moments, stop = second_order(affine), start + affine.outputs
+        for bounds, bound in ((spreads, moments.spread), (shifts, moments.shift), (powers, moments.power)):
+            bounds.append(place_on_diagonal(bound, start, channel.outputs))
+        reaches.append(_find_reach_of_mean(affine, mean[start:stop]))
         start = stop
     part_of_output = np.repeat(np.arange(len(channel.maps)), [affine.outputs for affine in channel.maps])
     off_diagonal = (part_of_output[:, None] != part_of_output[None, :])[:, :, None, None]
@@ -285,15 +288,26 @@ def _bound_stacked_maps(channel: Stack) -> list[QuadraticMap]:
     reach, size = xp.concatenate(reaches), xp.abs(mean)
     cross = symmetric_product(reach, reach)
     power_cross = drop_constant(symmetric_product(size, reach) + symmetric_product(reach, size) + cross)
-    # Center and radius of the entries off the diagonal, of spread, shift and power in turn.
-    centers = (0.0, 0.0, drop_constant(symmetric_product(mean, mean)))
-    radii = (cross, cross, power_cross)
-    return [
-        QuadraticMap(
-            sum(q.center for q in maps) + off_diagonal * center, sum(q.radius for q in maps) + off_diagonal * radius
+
+    def join(blocks: list[QuadraticMap], center: Tensor | float, radius: Tensor) -> QuadraticMap:
+        """Return the bound with these diagonal blocks, and with `center` and `radius` in all other entries."""
+        return QuadraticMap(
+            sum(q.center for q in blocks) + off_diagonal * center, sum(q.radius for q in blocks) + off_diagonal * radius
         )
-        for maps, center, radius in zip(zip(*blocks, strict=True), centers, radii, strict=True)
-    ]
+
+    power_of_mean = drop_constant(symmetric_product(mean, mean))
+    return [join(spreads, 0.0, cross), join(shifts, 0.0, cross), join(powers, power_of_mean, power_cross)]
+
+
+def _find_reach_of_mean(affine: AbstractRandomAffine, mean: Matrix) -> Matrix:
+    """Return the largest |E_v[(G, n)] - M| of each entry under any possible law v; M is the nominal `mean`."""
+    low, high = affine.moment_interval(1)
+    xp = library(low, high, mean)
+    # `low` and `high` are of E[H], whose last row is (0, 1).
+    to_high = high[:-1] - mean
+    to_low = low[:-1] - mean
+    reach: Matrix = xp.maximum(xp.abs(to_high), xp.abs(to_low))
+    return reach
 
 
 def _compute_mean_and_covariance(channel: AbstractRandomAffine) -> tuple[Matrix, Tensor]:
@@ -309,14 +323,19 @@ def _compute_mean_and_covariance(channel: AbstractRandomAffine) -> tuple[Matrix,
     if isinstance(channel, Stack):
         return library(means).concatenate(means), _stack_covariances(spreads)
     # In a sum the spreads of the parts and of its own noise add up.
-    mean_of_maps, size = channel.sum_in_places(dict(enumerate(means)), axes=1), channel.inputs + 1
+    mean_of_maps = channel.sum_in_places(dict(enumerate(means)), axes=1)
+    size = channel.inputs + 1
     noise = channel.noise.covariance[..., None, None] * make_power_of_constant(size)
     spread: Tensor = channel.sum_in_places(dict(enumerate(spreads)), axes=2) + noise
     return mean_of_maps + channel.noise.mean[:, None] * np.eye(size)[-1], spread
 
 
 def _noise_covariance(channel: AbstractRandomAffine) -> Float[jax.Array | np.ndarray, "m m"]:
-    """Return Cov(z | y) of a channel of known gain, that of its noise; for a stack or sum it comes from its maps."""
+    """Return Cov n of a channel z = G y + n whose gain G is known.
+
+    For a stack the covariances of its maps are diagonal blocks, and for a sum they add up, so that no tensor of all
+    outputs and inputs is needed.
+    """
     covariance: Matrix
     if isinstance(channel, Stack):
         covariance = block_diagonal([_noise_covariance(affine) for affine in channel.maps])
@@ -332,7 +351,8 @@ def _stack_covariances(spreads: Sequence[Tensor]) -> Tensor:
 
     `spreads` has for each map the covariances (m, m, p + 1, p + 1) of its (G, n); they are diagonal blocks.
     """
-    outputs_by_map, size = [len(spread) for spread in spreads], spreads[0].shape[-1]
+    outputs_by_map = [len(spread) for spread in spreads]
+    size = spreads[0].shape[-1]
     outputs = sum(outputs_by_map)
     # Places of the blocks' entries (i, j) in the flat (outputs, outputs).
     rows_by_map = np.split(np.arange(outputs), np.cumsum(outputs_by_map)[:-1])
@@ -340,60 +360,3 @@ def _stack_covariances(spreads: Sequence[Tensor]) -> Tensor:
     entries = library(spreads).concatenate([spread.reshape(-1, size**2) for spread in spreads])
     stacked: Tensor = scatter((outputs**2, size**2), places, entries).reshape(outputs, outputs, size, size)
     return stacked
-
-
-def _bound_sum(channel: Superposed, parts: Sequence[MomentBounds]) -> MomentBounds:
-    """Return the bounds of a sum of independent maps and a noise, from those of each map.
-
-    Spreads (second moments about nominal means) add up; shifts of means, D_i, between laws meet in every pair of maps.
-    With Y = E[(y, 1) (y, 1)'] and weights w of sum 1, in proportion to the shifts' sizes, (sum D_i) Y (sum D_i)' <=
-    sum_i D_i Y D_i' / w_i, and the spread of the sum is within sum_i Spread_i + (1 / w_i - 1) D_i Y D_i'.
-
-    Args:
-        channel: the sum.
-        parts: bounds of each of its maps.
-    """
-    # Nominal mean, map of the noise, of the mean's power, and sum of the spreads.
-    every = range(len(parts))  # numbers of the parts
-    mean = channel.sum_in_places({i: parts[i].mean for i in every}, axes=1)
-    mean = mean + channel.noise.mean[:, None] * np.eye(channel.inputs + 1)[-1]
-    noise = map_of_known_law(channel.noise.covariance[..., None, None] * make_power_of_constant(channel.inputs + 1))
-    power_of_mean = map_of_known_law(drop_constant(symmetric_product(mean, mean)))
-    spread = add_maps(_sum_maps(channel, {i: (parts[i].spread, 1.0) for i in every}), noise)
-    # All means are known: no shifts.
-    sizes = [size_of_map(bounds.shift) for bounds in parts]
-    total = sum(sizes)
-    if is_zero(total):
-        return MomentBounds(
-            mean=mean,
-            spread=spread,
-            shift=scale_map(noise, 0.0),
-            power=add_maps(signal_of_map(spread), power_of_mean),
-            nominal=spread,
-        )
-    inverse_weights = {i: total / sizes[i] for i in every if not is_zero(sizes[i])}  # 1 / w_i
-    shift = _sum_maps(channel, {i: (parts[i].shift, inverse) for i, inverse in inverse_weights.items()})
-    cross = _sum_maps(channel, {i: (parts[i].shift, inverse - 1) for i, inverse in inverse_weights.items()})
-    # Power: of the mean m shifted by d, (m + d)^2 <= (1 + d / m) m^2 + (1 + m / d) d^2, and the variances.
-    mean_size = size_of_map(power_of_mean)
-    ratio = total / library(mean_size).where(mean_size > 0, mean_size, 1.0)  # d / m
-    widened_mean, widened_shift = scale_map(power_of_mean, 1 + ratio), scale_map(signal_of_map(shift), 1 + 1 / ratio)
-    return MomentBounds(
-        mean=mean,
-        spread=add_maps(spread, cross),
-        shift=shift,
-        power=add_maps(signal_of_map(spread), widened_mean, widened_shift),
-        nominal=add_maps(_sum_maps(channel, {i: (parts[i].nominal, 1.0) for i in every}), noise),
-    )
-
-
-def _sum_maps(channel: Superposed, weighted: Mapping[int, tuple[QuadraticMap, Any]]) -> QuadraticMap:
-    """Return sum_i w_i Q_i, the second-moment maps Q_i of some of the summands z_i = H_i (y_i, 1) of a channel.
-
-    `weighted` holds (Q_i, w_i) by the summand's number i. Q_i acts on E[(y_i, 1) (y_i, 1)'] of the components y_i of y
-    that summand i takes. The sum acts on E[(y, 1) (y, 1)'], with the entries of each Q_i at these components.
-    """
-    scaled = {i: scale_map(moment_map, weight) for i, (moment_map, weight) in weighted.items()}
-    centers = {i: moment_map.center for i, moment_map in scaled.items()}
-    radii = {i: moment_map.radius for i, moment_map in scaled.items()}
-    return QuadraticMap(channel.sum_in_places(centers, axes=2), channel.sum_in_places(radii, axes=2))

@@ -12,7 +12,7 @@ from heliograph.numerics.types import Array, Float, Scalar
 from heliograph.random_affine.moments.monomials import JointMoments
 
 T = TypeVar("T")
-Second = Float[Array, "p p"]  # E (y, 1)(y, 1)'
+Second = Float[Array, "p p"]  # second moment E (y, 1)(y, 1)' of a signal y and the constant 1
 
 
 class SignalMoment(NamedTuple):
@@ -22,9 +22,8 @@ class SignalMoment(NamedTuple):
     arrives: Scalar
 
 
-Visit = Callable[
-    [str, Any, SignalMoment | None], Any
-]  # of the name of a hop, the hop, and what it receives: another hop
+# Function of a hop's name, the hop, and the second moment of what it receives; it returns a hop to put in its place.
+Visit = Callable[[str, Any, SignalMoment | None], Any]
 
 
 class ChannelPosition(NamedTuple):
@@ -72,7 +71,8 @@ class ChannelPosition(NamedTuple):
 def carry_by_moments(signal: SignalMoment, moments: JointMoments) -> SignalMoment:
     """Return E (z, 1)(z, 1)' behind a random map, by its mean and second moments, from E (y, 1)(y, 1)' before it."""
     second, tensor = signal.second, moments.second
-    mean, xp = moments.mean[:-1] @ second[:, -1], library(tensor, second)
+    mean = moments.mean[:-1] @ second[:, -1]
+    xp = library(tensor, second)
     of_z = xp.einsum("ijab,ab->ij", tensor, second)
     second_behind = xp.block([[of_z, mean[:, None]], [mean[None], np.ones((1, 1))]])
     return signal._replace(second=second_behind)
@@ -88,5 +88,6 @@ def refuse_gain_on_angles(got: str) -> ValueError:
 
 
 def apply(h: jax.Array, y: jax.Array) -> jax.Array:
-    """Return z = G y + n for a drawn H."""
-    return h[:-1, :-1] @ y + h[:-1, -1]
+    """Return z = G y + n for a drawn H = [[G, n], [0, 1]] of shape (outputs + 1, inputs + 1)."""
+    gain, noise = h[:-1, :-1], h[:-1, -1]
+    return gain @ y + noise

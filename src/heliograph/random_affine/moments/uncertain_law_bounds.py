@@ -70,7 +70,9 @@ def _find_dominating_tensor(tensors: Tensor, mean: Matrix) -> tuple[Tensor, np.n
     """
     xp = library(tensors, mean)
     shape = symmetric_product(mean[:, :-1], mean[:, :-1])  # M y y' M' (m, m, p, p)
-    gains, noises, cross = tensors[..., :-1, :-1], tensors[..., -1, -1], tensors[..., :-1, -1]
+    gains = tensors[..., :-1, :-1]
+    noises = tensors[..., -1, -1]
+    cross = tensors[..., :-1, -1]
     mean_size: Matrix = xp.abs(mean[:, :-1])
     # Sizes for relative tolerances: of the gains' entries (m, m, p, p), of each noise (m,), and of the product of entry
     # (i, a) of a gain and noise j, at (i, j, a).

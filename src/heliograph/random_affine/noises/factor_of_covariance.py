@@ -11,12 +11,12 @@ from heliograph.factors.covariance_factors import columns_of
 from heliograph.numerics.check import is_diagonal
 from heliograph.numerics.numpy_or_jax import is_traced
 
-LARGE = 100  # components of independent noises whose root needs no eigenvectors: 18 ms for 1,000 alike, 3 s with them
-FACTOR_TOLERANCE = 1e-10  # of two standard deviations: what a factor may miss of a covariance
+LARGE = 100  # a diagonal matrix of more components gets its root without eigenvectors: 18 ms for 1,000, 3 s with them
+FACTOR_TOLERANCE = 1e-10  # allowed |A A' - S|_ij, as a share of the product of the deviations of i and j
 
 
 def factor_by_eigenvectors(covariance: np.ndarray) -> np.ndarray:
-    """Return A with A A' = S from eigenvectors of S, or of its correlations where S loses digits of small components.
+    """Return A with A A' = S, from eigenvectors of S, or of the correlations if S has components of other sizes.
 
     Eigenvalues are exact to rounding of the largest one, so that a component in small units would be lost. An
     eigenvalue below that rounding is set to zero, since its root of about 1e-8 would add noise to combinations that
@@ -49,22 +49,27 @@ class WeightsOfFactor:
     """
 
     def __init__(self, factor: Callable[[np.ndarray], np.ndarray], tolerance: float):
-        """Hold the function that factors a covariance, and the tolerance."""
+        """Hold `factor`, which returns A with A A' = S, and the relative tolerance of A diag(w) A' = S."""
         self.factor, self.tolerance = factor, tolerance
         # By identity of a factor: references to it and to the covariance to which it was found to belong.
         self._found: dict[int, tuple[ref[Any], ref[Any]]] = {}
 
     def __get__(self, noise: Any, kind: type | None = None) -> Any:
-        """Return the weights of a noise; the class itself has none."""
+        """Return the weights w of a noise; on the class itself raise AttributeError, as for any field."""
         if noise is None or "weights" not in noise.__dict__:
             raise AttributeError("weights")
         return noise.__dict__["weights"]
 
     def __set__(self, noise: Any, weights: Any) -> None:
-        """Hold the weights, and factor the covariance where the factor is that of another one."""
-        held = noise.__dict__
+        """Hold the weights w; factor the covariance anew if A (`factor`) and w are not those of this covariance.
+
+        They are not if JAX or Equinox made the noise anew with another covariance. Numbers are compared. Of a traced
+        factor nothing is known but the covariance object with which it came first.
+        """
+        held = noise.__dict__  # the fields of the noise by name
         held["weights"] = weights
-        covariance, factor = held.get("covariance"), held.get("factor")
+        covariance = held.get("covariance")
+        factor = held.get("factor")
         found_factor, found_covariance = self._found.get(id(factor), (None, None))
         is_found = found_factor is not None and found_factor() is factor
         if is_found and found_covariance is not None and found_covariance() is covariance:
@@ -73,7 +78,7 @@ class WeightsOfFactor:
             S = np.asarray(covariance)
             if self._belongs_to(np.asarray(factor), np.asarray(weights), S):
                 self._note(factor, covariance)
-            else:
+            else:  # one covariance (n, n), or several along leading axes
                 n = S.shape[-1]
                 held["factor"] = np.reshape([self.factor(one) for one in S.reshape(-1, n, n)], S.shape)
                 held["weights"] = np.ones(S.shape[:-1])
@@ -96,11 +101,11 @@ class WeightsOfFactor:
         return bool(np.all(np.abs((A * w[..., None, :]) @ A.swapaxes(-1, -2) - S) <= allowed))
 
     def _note(self, factor: Any, covariance: Any) -> None:
-        """Note that a factor belongs to a covariance, as long as both are held somewhere."""
+        """Remember that a factor was found to belong to a covariance, until the factor is no longer in use."""
         key = id(factor)
         self._found[key] = ref(factor, lambda _: self._found.pop(key, None)), ref(covariance)
 
 
 def _is_known(part: object) -> bool:
-    """Return whether a part is an array of numbers, and not traced or a mark of what stands there."""
+    """Return whether a part is an array of numbers: not traced by JAX, and no placeholder in its place."""
     return isinstance(part, np.ndarray) or (isinstance(part, jax.Array) and not isinstance(part, jax.core.Tracer))

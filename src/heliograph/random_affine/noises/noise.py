@@ -76,7 +76,10 @@ class AbstractNoise(Module):
         return False
 
     def branches(self) -> GaussianBranches:
-        """Return each component as a mixture of Gaussian branches about the mean; one unless the law says more."""
+        """Return each component's law as a mixture of Gaussians ("branches"), whose means are relative to E[n].
+
+        By default it is one branch: N(0, variance), exact for Gaussian noise.
+        """
         variances = library(self.covariance).diagonal(self.covariance)[:, None]
         return GaussianBranches(np.zeros((self.dimension, 1)), np.zeros((self.dimension, 1)), variances)
 
@@ -104,7 +107,7 @@ class AbstractNoise(Module):
         return SignalNoise(self.columns, self.covariance)
 
     def list_atoms(self) -> list[NoiseAtom]:
-        """Return all combinations of the atoms of the noise, where these are finitely many; by default a refusal."""
+        """Return the noise as a mixture of atoms c + N(0, R) with probabilities; by default raise ValueError."""
         raise fail("mixture filter", "noises of finite support or Gaussian", type(self).__name__)
 
     def split(self, groups: Sequence[Sequence[int]]) -> "list[AbstractNoise] | None":
@@ -113,11 +116,11 @@ class AbstractNoise(Module):
         return self._split(groups) if complete and not is_traced(self) else None
 
     def _split(self, groups: Sequence[Sequence[int]]) -> "list[AbstractNoise] | None":
-        """Split at complete groups; by default, None."""
+        """Return the noise of each group, where groups have all components; None (the default) if not independent."""
         return None
 
     def sample(self, key: jax.Array) -> jax.Array:
-        """Draw one vector; shape (dimension,)."""
+        """Draw one noise vector n of shape (dimension,)."""
         raise unwritten(self, "sample")
 
     def moment(self, powers: Exponents) -> Number:
@@ -139,7 +142,10 @@ class Gaussian(AbstractNoise):
     weights: Vector = WeightsOfFactor(factor_by_eigenvectors, FACTOR_TOLERANCE)  # type: ignore[assignment]
 
     def __init__(self, covariance: ArrayLike, mean: ArrayLike | None = None):
-        """Hold covariance and mean, and a square root of the covariance: factor diag(weights) factor'."""
+        """Hold covariance and mean, and a factor A with weights w of the covariance, A diag(w) A', to draw from.
+
+        Known numbers are factored by eigenvectors, w = 1; a covariance that JAX traces as L diag(d) L'.
+        """
         self.covariance = check.covariance("noise covariance", covariance)
         n = self.covariance.shape[-1]
         self.mean = np.zeros(n) if mean is None else array("noise mean", mean, (n,))
@@ -160,7 +166,7 @@ class Gaussian(AbstractNoise):
 
     @property
     def is_symmetric(self) -> bool:
-        """Always True."""
+        """Always True: a Gaussian law is symmetric about its mean."""
         return True
 
     def list_atoms(self) -> list[NoiseAtom]:
@@ -182,7 +188,10 @@ class Gaussian(AbstractNoise):
         return jnp.asarray(self.mean + A @ e)
 
     def moment(self, powers: Exponents) -> Number:
-        """Return E[n^a] by E[n_i g(n)] = m_i E[g] + sum_j S_ij E[dg/dn_j] (Isserlis, Stein)."""
+        """Return E[n^a] = E[n_1^a_1 n_2^a_2 ...], a = `powers`, of n ~ N(m, S).
+
+        It is found by Stein's identity E[n_i g(n)] = m_i E[g] + sum_j S_ij E[dg/dn_j], which lowers the degree.
+        """
 
         @cache
         def expectation(a: Exponents) -> Number:
@@ -254,7 +263,8 @@ class Independent(AbstractNoise):
             raise fail("independent noises", "at least one", "none")
         if no_noises := [noise for noise in self.parts if not isinstance(noise, AbstractNoise)]:
             raise fail("independent noises", "laws of a noise vector", show_value(no_noises[0]))
-        means, covariances = [noise.mean for noise in self.parts], [noise.covariance for noise in self.parts]
+        means = [noise.mean for noise in self.parts]
+        covariances = [noise.covariance for noise in self.parts]
         self.mean = library(means).concatenate(means)
         self.covariance = block_diagonal(covariances)
 
@@ -353,7 +363,10 @@ NoiseLike = TypeAliasType("NoiseLike", AbstractNoise | ArrayLike)  # a law, a co
 
 
 def as_noise(name: str, value: NoiseLike, dimension: int) -> AbstractNoise:
-    """Return a noise law as it is, and for a covariance or variance the Gaussian noise of mean zero."""
+    """Return a noise law as it is, and for a covariance or variance the Gaussian noise of mean zero.
+
+    `name` says in errors what the noise is.
+    """
     if isinstance(value, eqx.Module) and not isinstance(value, AbstractNoise):
         expected = "a variance, a covariance or a law of a noise vector (Gaussian, FiniteSupport, Independent, Shaped)"
         raise fail(name, expected, type(value).__name__)
@@ -377,6 +390,9 @@ def count_components(value: NoiseLike) -> int | None:
 
 @singledispatch
 def noise_moment_vector(noise: AbstractNoise, order: int) -> Vector:
-    """Return E[mono_order(n)] of a noise law: all moments up to `order`, (C(dimension + order, order),)."""
-    moment = noise.moment  # of a module, whose methods are slow to look up
+    """Return all moments E[n^a] with |a| <= `order` of a noise law, (C(dimension + order, order),).
+
+    They are in the order of the monomials n^a 1^(order - |a|) in `list_exponents`.
+    """
+    moment = noise.moment  # looked up once: attribute access of a module is slow
     return stack_parts([moment(powers[:-1]) for powers in list_exponents(noise.dimension + 1, order)])

@@ -80,8 +80,8 @@ def check_moments(moments: np.ndarray) -> None:
     its range.
     """
     sequence = np.concatenate([[1.0], moments])
-    # m[k] = E[n^k] in units of root(E[n^2])^k, so that one tolerance serves all orders; up to the first order whose
-    # unit is no double.
+    # m[k] = E[n^k] in units of root(E[n^2])^k, so that one tolerance serves all orders. Orders from the first one on
+    # whose unit overflows or underflows in double precision are not checked.
     scale = max(float(sequence[2]) ** 0.5, np.finfo(float).tiny) if sequence[2] > 0 else 1.0
     size = scale ** np.arange(len(sequence))
     representable = np.cumprod((size > np.finfo(float).tiny) & np.isfinite(size), dtype=bool)
@@ -92,7 +92,7 @@ def check_moments(moments: np.ndarray) -> None:
         h = np.array([m[a + j] for a in range(j) if a + j < len(m)])
         if len(h) < j:  # higher moments are not given
             return
-        solution = np.linalg.lstsq(H, h, rcond=MOMENT_TOLERANCE)[0]
+        solution = np.linalg.lstsq(H, h, rcond=MOMENT_TOLERANCE)[0]  # H^-1 h, or H^+ h where H is singular
         gap = np.max(np.abs(H @ solution - h))
         if gap > np.sqrt(MOMENT_TOLERANCE) * np.max(np.abs(h), initial=1.0):
             expected = "a law of the atoms that the lower moments imply"
@@ -160,7 +160,7 @@ class CentredNoise(AbstractNoise):
         self.mean = np.zeros(source.dimension)
 
     def sample(self, key: jax.Array) -> jax.Array:
-        """Draw n - E[n]."""
+        """Draw n from its law, and return n - E[n]."""
         return self.source.sample(key) - jnp.asarray(self.source.mean)
 
     def moment(self, powers: Exponents) -> Number:

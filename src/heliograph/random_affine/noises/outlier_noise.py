@@ -20,7 +20,7 @@ from heliograph.random_affine.noises.noise import AbstractNoise, Gaussian, Matri
 
 PRECISIONS = 10.0 ** (-5 + 5.7 * np.arange(25) / 24)
 """Precisions, in units of the scale's, at which Student's law is read as a mixture of Gaussian ones."""
-LEAST_SHARE = 1e-12  # of each of them: none is excluded
+LEAST_SHARE = 1e-12  # least probability of each precision before normalisation, so that none is excluded
 
 Stack = Float[jax.Array | np.ndarray, "branches n n"]
 
@@ -64,12 +64,12 @@ class StudentT(AbstractNoise):
 
     @property
     def has_outliers(self) -> bool:
-        """Always True."""
+        """Always True: Student's law has heavy tails."""
         return True
 
     @property
     def is_symmetric(self) -> bool:
-        """Always True."""
+        """Always True: Student's law is symmetric about 0."""
         return True
 
     def branches(self) -> GaussianBranches:
@@ -88,7 +88,7 @@ class StudentT(AbstractNoise):
         return StudentT(matrix @ self.scale @ matrix.T, self.degrees).branches()
 
     def without_outliers(self) -> NoiseWithoutOutliers:
-        """Return the Gaussian noise of the scale."""
+        """Return mean 0 and the scale as covariance, which Student's noise without its heavy tails has."""
         return NoiseWithoutOutliers(np.zeros(self.dimension), self.scale)
 
     def sample(self, key: jax.Array) -> jax.Array:
@@ -140,7 +140,11 @@ class Contaminated(AbstractNoise):
     bounded: bool = eqx.field(static=True)
 
     def __init__(self, covariance: ArrayLike, share: ArrayLike, outlier_covariance: ArrayLike, bias: ArrayLike = 0.0):
-        """Hold shares, means and covariances of the mixture: noise without outliers first, then the outliers."""
+        """Hold the Gaussian branches of the mixture: first the noise without outliers, then each kind of outlier.
+
+        shares p_j (branches,), means m_j (branches, n), covariances R_j (branches, n, n); and of the whole the mean
+        m = sum_j p_j m_j and the covariance sum_j p_j (R_j + (m_j - m) (m_j - m)').
+        """
         # Shares, covariances and biases of the kinds of outliers, one each.
         inlier = check.covariance("covariance of contaminated noise", covariance, _size_of_number(covariance))
         n = inlier.shape[-1]
@@ -217,12 +221,12 @@ class Contaminated(AbstractNoise):
 
     @property
     def has_outliers(self) -> bool:
-        """Always True."""
+        """Always True: each vector is an outlier with a probability."""
         return True
 
     @property
     def is_symmetric(self) -> bool:
-        """True where no branch is biased."""
+        """True if all branches, with and without outliers, have the mean 0."""
         return not np.any(np.asarray(self.means) != 0)
 
     def branches(self) -> GaussianBranches:
@@ -256,16 +260,17 @@ class Contaminated(AbstractNoise):
         return samples[branch]
 
     def moment(self, powers: Exponents) -> Number:
-        """Return the mean of the branches' moments."""
+        """Return E[n^a] = sum_j p_j E_j[n^a], a mean over the Gaussian branches j; `powers` are the exponents a."""
         items = zip(self.shares, self.covariances, self.means, strict=True)
         return sum((plain(p) * Gaussian(r, m).moment(powers) for p, r, m in items), start=0.0)
 
 
 def gamma_mass_of_precisions(degrees: ArrayLike) -> Vector:
-    """Return the shares of the PRECISIONS, at least LEAST_SHARE, by which Gaussian laws make up Student's law.
+    """Return the probabilities with which Gaussian laws of variance scale / l, l in PRECISIONS, make up Student's law.
 
-    The precision l has a gamma law of mean 1: a chi-squared variable divided by its degrees of freedom. A share is the
-    mass of l between the geometric means of neighbouring PRECISIONS.
+    The precision l has a gamma law of mean 1: a chi-squared variable divided by its degrees of freedom. The probability
+    of one of the PRECISIONS is the mass of l between the geometric means with its neighbours, raised to LEAST_SHARE if
+    it is less; then all are divided by their sum.
     """
     xp: Any = library(degrees)
     half_degrees = xp.asarray(degrees) / 2
@@ -291,12 +296,15 @@ def has_bounded_noise(*parts: PyTree) -> bool:
 
 
 def _size_of_number(value: ArrayLike) -> int | None:
-    """Return the size of the matrix that a number is, 1; None of a matrix, which has its own."""
+    """Return 1 for a number, which is a covariance (1, 1); None for a matrix, whose size is its own."""
     return None if rank("covariance", value) else 1
 
 
 def _read_shares(share: ArrayLike) -> tuple[list[Number], bool]:
-    """Return the probabilities of the kinds of outliers, and whether a list of them was given."""
+    """Return the probabilities of the kinds of outliers, and whether a list of them was given.
+
+    A single number is one kind. The noise is without outliers with the probability that is left to 1.
+    """
     if not rank("share of outliers", share):
         return [scalar("share of outliers", share, low=0.0, high=1.0)], False
     values = array("shares of outliers", share, ("kinds",))

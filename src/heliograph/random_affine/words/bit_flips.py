@@ -19,7 +19,7 @@ from heliograph.random_affine.moments.monomials import JointMoments
 from heliograph.random_affine.noises.noise import Gaussian
 from heliograph.random_affine.series_and_stack import Series, Stack
 
-MOST_ATOMS = 64  # of the error rate of a chain
+MOST_ATOMS = 64  # most combinations of the hops' error rates
 
 
 class Flips(AbstractRandomAffine):
@@ -91,14 +91,15 @@ class Flips(AbstractRandomAffine):
         raise fail("channel of words", "a node that has the encoder of the words (encoder=...)", "one that has none")
 
     def in_words(self) -> str:
-        """Return how many of the bits flip."""
+        """Return a text with the mean share of flipped bits, such as "words, 1% of bits flipped"."""
         return f"words, {write_percentage(self.error.moment(1))} of bits flipped"
 
 
 class BitFlips(AbstractRandomAffine):
     """The link of codewords as a link of their bits, signs -1 or 1, each of which is flipped with probability p.
 
-    y has for each word `bits` signs, and behind them `beside` more numbers, such as a dither, that arrive as they are.
+    error: law of p. dimension: number of words of a message. per_message: True if one p is drawn for all of them. y has
+    for each word `bits` signs, and behind them `beside` more numbers, such as a dither, that arrive as they are.
     """
 
     error: Constant | Discrete
@@ -109,12 +110,12 @@ class BitFlips(AbstractRandomAffine):
 
     @property
     def outputs(self) -> int:
-        """Length of z: for each of the `dimension` words its `bits` signs and `beside` other numbers."""
+        """Length of z: for each of the `dimension` words its `bits` signs, then `beside` numbers sent with the word."""
         return self.dimension * (self.bits + self.beside)
 
     @property
     def inputs(self) -> int:
-        """Length of y: that of z."""
+        """Length of y, in the order of z: for each word its signs, then the numbers sent with it."""
         return self.outputs
 
     def sample(self, key: jax.Array) -> jax.Array:

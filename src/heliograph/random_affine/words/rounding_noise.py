@@ -16,8 +16,8 @@ from heliograph.random_affine.moments.mixture_components import GaussianBranches
 from heliograph.random_affine.moments.monomials import Exponents
 from heliograph.random_affine.noises.noise import AbstractNoise, Gaussian, Number, Square, Vector
 
-TERMS = 32  # of the series of E f(1 - f); what is left is added as a bound
-DITHERLESS = 1 - 1e-9  # deviations of Gaussian noise, in steps, from which on rounding needs no other dither
+TERMS = 32  # terms of the series of E f(1 - f) that are summed; a bound of the others is added
+DITHERLESS = 1 - 1e-9  # variance of Gaussian noise, in squared steps, from which on rounding needs no other dither
 
 
 class RoundingError(NamedTuple):
@@ -27,7 +27,7 @@ class RoundingError(NamedTuple):
     whole: float
 
 
-LARGEST = {  # whatever y is
+LARGEST = {  # by dither, the largest variances that the rounding error may have, whatever y is
     "none": RoundingError(1 / 12, 1 / 12),  # of a y whose density is flat over a step
     "triangular": RoundingError(1 / 4, 1 / 4),
     "stochastic": RoundingError(1 / 4, 1 / 4),
@@ -200,7 +200,8 @@ class RoundedNoise(AbstractNoise):
 
         They are those of the sensor's noise v, each with the largest variance of the rounding error e added.
         """
-        branches, error_variance = self.source.branches(), LARGEST[self.dither].error * self.step**2
+        branches = self.source.branches()
+        error_variance = LARGEST[self.dither].error * self.step**2
         return branches._replace(variance=branches.variance + error_variance[:, None])
 
     def without_outliers(self) -> NoiseWithoutOutliers:
@@ -236,12 +237,12 @@ class RoundedNoise(AbstractNoise):
 
 
 def find_rounded_noises(*models: PyTree) -> Sequence[RoundedNoise]:
-    """Return the noises of rounded measurements in these models."""
+    """Return every `RoundedNoise` inside these models, at any depth."""
     leaves = jax.tree.leaves(models, is_leaf=lambda leaf: isinstance(leaf, RoundedNoise))
     return [leaf for leaf in leaves if isinstance(leaf, RoundedNoise)]
 
 
 def round_without_dither(noise: AbstractNoise, resolution: Float[np.ndarray, " m"]) -> RoundedNoise:
-    """Return the noise of a sensor that reports multiples of its resolution."""
+    """Return the noise of a sensor that reports the nearest multiple of its resolution (m,) to its measurement."""
     zero = np.zeros(noise.dimension)
     return RoundedNoise(noise, resolution, zero, zero, "none")
