@@ -273,8 +273,9 @@ def find_claims(network: HasNodes) -> dict[tuple[str, str], Claim]:
 def _find_claim_of_fusion(network: HasNodes, fusion: Fusion | AbstractFilter) -> Claim:
     """Return what a fusion can claim of its covariance, from its rule, its nodes' claims and how they report.
 
-    A claim is what the covariance is said to be: exact, an upper bound, or nominal. A report is the estimate that a
-    node sends to the centre; with `by_report` the centre models the report's way, its uplink or its quantizer.
+    A claim is what the covariance is said to be: exact, an upper bound, or nominal. An informed rule is one that needs
+    the joint covariance of the nodes' errors. A report is the estimate that a node sends to the centre; with
+    `by_report` the centre models the report's way, its uplink or its quantizer.
 
     Args:
         network: the network, whose nodes have filters and claims.

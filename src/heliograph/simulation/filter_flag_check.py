@@ -56,7 +56,8 @@ def check_filter_flags(name: str, filter: AbstractFilter, channels: Sequence[Abs
 def _find_flag_filters(filter: AbstractFilter) -> list[SideInformationFilter | ModeObservedFilter]:
     """Return the filters that use flags, also those inside other filters.
 
-    A flag is a number after the measurement that tells the mode of a link.
+    A flag is a number after the measurement that tells the mode of a link. `ModeObservedFilter` always uses flags,
+    `SideInformationFilter` only where it is `flagged`: else it uses other side information, without flags.
     """
     kinds = SideInformationFilter, ModeObservedFilter
     leaves = jax.tree.leaves(filter, is_leaf=lambda leaf: isinstance(leaf, kinds))

@@ -138,7 +138,7 @@ class Network(Module):
         self.rows = FrozenMapping(find_rows_of_nodes({name: node.received for name, node in self.nodes.items()}))
         # A filter made for other models than its node's claims less. Arrays get one length, so that they stack.
         self.nodes = pad_filters_alike(lower_claims_of_nodes(self))
-        # Groups of nodes and stacks of filters, by structure.
+        # Groups of nodes and stacks of filters, by structure. `meshes`: each node's fusions between neighbours.
         meshes = {name: tuple(m for m in self.meshes if name in self.mesh_nodes(m)) for name in self.names}
         self.groups = group_by_structure(
             (name, without_output_names((get_parts_of_reception(n), n.filters, meshes[name])))
@@ -159,9 +159,8 @@ class Network(Module):
         """Raise ValueError unless nodes and filters fit the plant, and names' checksums, which seed draws, differ."""
         node_type = Node if self.relays is None and self.common is None else ReceivingNode
         for name, node in self.nodes.items():
-            if (
-                not isinstance(node, ReceivingNode) or node.filters
-            ):  # a ReceivingNode without filters may stand anywhere
+            may_stand_anywhere = isinstance(node, ReceivingNode) and not node.filters
+            if not may_stand_anywhere:
                 check_type(f"node {name!r}", node, node_type)
             for label, filter in node.filters.items():
                 check_states(f"filter {label!r} of node {name!r}", filter, self)

@@ -94,12 +94,14 @@ class AllFilters(Module):
         self.smooths, self.judges = smoothed_stacks is not None, judges
         self.stacks = stack_filters(network, smoothed_stacks or (), judges)
         # At the centre: filters of all measurements; fusions by rules that need nothing but the estimates; fusions that
-        # need the joint covariance of the nodes' errors; fusions of reports over uplinks; fusions between neighbours.
+        # need the joint covariance of the nodes' errors.
         self.central = {name: fusion for name, fusion in network.fused.items() if isinstance(fusion, AbstractFilter)}
         self.fusions, self.centres = list_stacked_fusions(network), list_centres(network)
-        self.reporting, self.meshes = build_report_fusions(network, AllFilters), build_meshes(network)
+        # Fusions of reports over uplinks: each centre steps the nodes' filters itself, without data, for the moments of
+        # their errors, and makes these filters by this class. Then fusions between neighbours.
+        self.reporting = build_report_fusions(network, AllFilters)
+        self.meshes = build_meshes(network)
         self.tests = make_fused_innovations(network, self.stacks) if tests else {}
-        # `order` brings the groups' measurements into the nodes' order; `complete`: nothing of a group is ever missing.
         self.order = find_measurement_order(network.groups, network.rows)
         self.complete = tuple(network.nodes[names[0]].complete for names in network.groups)
         self.n = len(network.states)
@@ -125,8 +127,7 @@ class AllFilters(Module):
     ) -> CentreState | dict[str, LinearisedFusionState]:
         """Return a centre's state before the first step, from the initial means of the filters that it fuses.
 
-        `states`: states of the nodes' filters by stack. `centre.sources`: (stack,
-        number within the stack) of each filter that it fuses.
+        `states`: of the nodes' filters by stack. `centre.sources`: (stack, number within the stack) of what it fuses.
         """
         means = []
         for stack, number in centre.sources:
@@ -154,9 +155,9 @@ class AllFilters(Module):
         the measurements are set to zero.
         """
         matrices = []
-        for stack, filter in centre.sources:
+        for stack, number in centre.sources:  # number of the filter within the stack
             stacked, zeros = self.stacks[stack], self._make_zeros(stack)
-            matrices.append(stacked.compute_by_node(centre.compute_matrices, states[stack], filter, zeros, u, k))
+            matrices.append(stacked.compute_by_node(centre.compute_matrices, states[stack], number, zeros, u, k))
         return matrices
 
     def step_without_data(self, states: PyTree, u: jax.Array, k: jax.Array) -> PyTree:

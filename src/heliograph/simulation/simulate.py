@@ -219,6 +219,8 @@ class _SimulationJob(Module):
 def _run_chunks(job: _SimulationJob, first_run: int, runs: int, chunk: int, progress: Progress | None) -> ReducedRuns:
     """Simulate all runs, chunk by chunk, in lanes side by side: return the sums over them, and what is collected."""
     with jax.enable_x64(True):
+        # Blocks of runs are dealt to lanes, which are computed side by side: each by a thread of its own (`alone`), or
+        # all by one program (`together`).
         lanes = RunLanes(
             alone=lambda blocks, carry: _simulate_lane((job, blocks), carry),
             together=partial(_simulate_all_lanes, job),
@@ -273,7 +275,7 @@ def _simulate_all_lanes(job: _SimulationJob, blocks: PyTree, carries: PyTree) ->
 
 
 def _simulate_block(job: _SimulationJob, runs: jax.Array) -> tuple[tuple[PyTree, PyTree], PyTree]:
-    """Return the sums and the flags of one block of runs, by batch, and what is collected, (run, time, ...)."""
+    """Return ((sums, counts of runs with a flag), collected) of a block: by batch, and collected (run, time, ...)."""
     recorded = _reduce(job.reducer, job.later, _simulate_outputs(job, runs))
     # The last block may have runs beyond the last one; run r belongs to batch r mod BATCHES.
     valid, start = jnp.asarray(runs) < job.stop, runs[0] % BATCHES

@@ -165,7 +165,8 @@ def cross_covariances(
     Source: Bar-Shalom, On the track-to-track correlation problem (1981), with the second moments of random gains.
     """
     instance("network", network, Network, "a Network")
-    # The errors of nodes are followed for a fusion with matrix weights, so one is made of the filters of this name.
+    # A centre that fuses with matrix weights propagates the joint covariance of the nodes' errors: make one for the
+    # filters of this name, in a network without other fusions.
     fusion = Fusion(filter, MatrixWeights())
     alone = Network(network.plant, network.nodes, {"all": fusion}, network.relays, network.common)
     filters, u = _plan_network_filters(alone, horizon, inputs)
@@ -229,7 +230,7 @@ def _compute_joint_error_factors(filters: AllFilters, u: np.ndarray) -> SourceFa
     `filters` has one fusion by the errors' joint covariance, whose centre has the models of the errors' recursion.
     """
     (centre,) = filters.linear_centres
-    filter_states, _, _, (centre_state,), *_ = filters.init()
+    filter_states, _, _, (centre_state,), *_ = filters.init()  # of the nodes' filters, and of the one centre
     nodes, n = centre_state.errors.bias.shape  # mean errors (node, n)
     # Each step adds sources: n of the plant's noise and, where nodes share their measurement noises, as many as all
     # nodes receive numbers.
@@ -265,6 +266,6 @@ def _compute_fused_covariances(filters: AllFilters, u: np.ndarray) -> PyTree:
             covariances |= {name: jnp.asarray(estimate.covariance) for name, estimate in estimates.items()}
         return (filters.step_without_data(states, u_k, k), tuple(next_centre_states)), covariances
 
-    states, _, _, centre_states, *_ = filters.init()
+    states, _, _, centre_states, *_ = filters.init()  # of the nodes' filters by stack, and of the centres
     _, covariances = jax.lax.scan(step, (states, centre_states), (jnp.arange(len(u)), jnp.asarray(u)))
     return covariances

@@ -100,8 +100,8 @@ class FusionCentre(Module):
     def propagate_error_factors(
         self,
         start: tuple[PyTree, SourceFactors],
-        compute_matrices: Callable[..., LinearStep],
-        step_filters: Callable[..., PyTree],
+        compute_matrices: Callable[[PyTree, jax.Array, jax.Array], LinearStep],
+        step_filters: Callable[[PyTree, jax.Array, jax.Array], PyTree],
         u: Array,
     ) -> SourceFactors:
         """Return the factors of the errors' joint covariance after all steps.
@@ -180,10 +180,11 @@ def join_step_matrices(matrices_by_source: Sequence[Matrices], order: np.ndarray
     def pad(name: str, leaf: jax.Array) -> jax.Array:
         """Return the matrix that is the field `name`, with its measurement axes padded to `size`.
 
-        MEASURED: by field the axes, counted from the last, that are as long as a measurement.
+        MEASURED: by field the axes, counted from the last (-1), that are as long as a measurement.
         """
-        measurement_axes = {leaf.ndim + axis for axis in MEASURED.get(name, ())}
-        padding = [(0, size - n) if axis in measurement_axes else (0, 0) for axis, n in enumerate(leaf.shape)]
+        padding = [(0, 0)] * leaf.ndim  # zeros before and after, along each axis
+        for axis in MEASURED.get(name, ()):
+            padding[axis] = (0, size - leaf.shape[axis])
         return jnp.pad(leaf, padding)
 
     matrices_class = type(matrices_by_source[0])

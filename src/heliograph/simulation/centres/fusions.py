@@ -250,14 +250,17 @@ def _keep_one_filter(node: Node | ReceivingNode, name: str) -> Node | ReceivingN
 def list_stacked_fusions(network: Network) -> tuple[StackedFusions, ...]:
     """Return the network's fusions by rules that need nothing but the estimates, those of one structure stacked.
 
+    Fusions that differ in numbers alone are stacked along a leading axis, so that one vectorised program computes all.
     Rules that need the joint covariance of the nodes' errors (`AbstractInformedFusion`) are left out.
     """
     names_by_structure: dict[object, list[str]] = {}
     for name, fusion in network.fused.items():
         if isinstance(fusion, Fusion) and not isinstance(fusion.rule, AbstractInformedFusion):
             nodes = network.nodes_with(fusion.filter)
-            # Fusions stack if their rules and quantizers have one structure, and they fuse equally many nodes.
-            key = structure_key((fusion.rule, fusion.uplinks(nodes), (None,) * len(nodes)))
+            # Fusions stack if their rules and quantizers have one structure, and they fuse equally many nodes: a tuple
+            # of None, one for each node, makes their number part of the structure.
+            node_count = (None,) * len(nodes)
+            key = structure_key((fusion.rule, fusion.uplinks(nodes), node_count))
             names_by_structure.setdefault(key, []).append(name)
     indices_by_filter, claims = network.estimate_indices, network.claims().get(FUSED, {})
     return tuple(
@@ -360,8 +363,8 @@ def find_source_filters(
     indices = [indices_by_filter[node, name] for node in nodes]
     sources = tuple(dict.fromkeys((index.stack, index.filter) for index in indices))  # each once, in order
     # The row of each node, if the sources' rows stand one source after another.
-    groups = [network.groups[network.stacks[stack].group] for stack, _ in sources]
-    row_of_node = {node: row for row, node in enumerate(node for names in groups for node in names)}
+    nodes_in_rows = [node for stack, _ in sources for node in network.groups[network.stacks[stack].group]]
+    row_of_node = {node: row for row, node in enumerate(nodes_in_rows)}
     return sources, np.array([row_of_node[node] for node in nodes])
 
 

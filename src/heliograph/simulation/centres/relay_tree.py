@@ -239,11 +239,13 @@ def _fuse_level_of_relays(errors: ErrorSources, degree: int) -> tuple[np.ndarray
     `errors`: the errors of the nodes below. Each relay fuses the next `degree` nodes, its children. The last relay may
     have fewer, and its weights are padded with zeros.
     """
-    groups = [_take_rows(errors, slice(i, i + degree)) for i in range(0, len(errors.independent), degree)]
-    outputs = [to_numpy(_fuse_at_relay(group)) for group in groups]
-    weights = np.stack([_pad_to_degree(relay_weights, degree) for relay_weights, _ in outputs])
-    relay_errors = [error for _, error in outputs]
-    return weights, jax.tree.map(lambda *leaves: np.stack(leaves), *relay_errors)
+    weights, relay_errors = [], []
+    for start in range(0, len(errors.independent), degree):
+        children = _take_rows(errors, slice(start, start + degree))
+        relay_weights, relay_error = to_numpy(_fuse_at_relay(children))
+        weights.append(_pad_to_degree(relay_weights, degree))
+        relay_errors.append(relay_error)
+    return np.stack(weights), jax.tree.map(lambda *leaves: np.stack(leaves), *relay_errors)
 
 
 @quickly_compiled
@@ -279,6 +281,7 @@ def _take_rows(numbers: PyTree, rows: int | slice) -> PyTree:
 
 def _count_leaves(numbers: PyTree) -> int:
     """Return how many nodes the arrays have along their leading axis; raise ValueError if lengths differ or are 0."""
+    # Lengths of all leading axes, None of a number without axes: there has to be one length, above 0.
     lengths = {np.shape(leaf)[0] if np.ndim(leaf) else None for leaf in jax.tree.leaves(numbers)}
     if len(lengths) != 1 or lengths & {None, 0}:
         raise fail("numbers of the leaves", "arrays with one leading axis of nodes", sorted(map(str, lengths)))

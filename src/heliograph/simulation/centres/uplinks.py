@@ -259,19 +259,22 @@ def _draw_links(group: ChannelGroup, delay: jax.Array, key: jax.Array, k: jax.Ar
 def build_uplinks(fusion: Fusion, nodes: Sequence[str], n: int) -> Uplinks:
     """Return the uplinks of these nodes to the centre of a fusion by reports of n numbers."""
     links, quantizers = fusion.links(nodes), fusion.quantizers(nodes)
-    ages = max(len(link.delay) for link in links)
     channels = [perfect(n) if link.channel is None else link.channel for link in links]
-    # Without a channel, and with one certain delay each, nothing is drawn.
-    random = any(link.channel is not None or np.max(link.delay) < 1 for link in links)
-    named = {f"{node} to the fusion centre": channel for node, channel in zip(nodes, channels, strict=True)}
-    # Received numbers of each node, and bounds on the quantizers' errors.
+    # Nothing is drawn if no link has a channel, and each has one delay of probability 1.
+    is_random = any(link.channel is not None or np.max(link.delay) < 1 for link in links)
+    channel_by_name = {f"{node} to the fusion centre": channel for node, channel in zip(nodes, channels, strict=True)}
+    # Probabilities of delays of 0, 1, ... steps, padded with zeros to the longest delay of all links.
+    ages = max(len(link.delay) for link in links)
+    delay = np.stack([np.pad(link.delay, (0, ages - len(link.delay))) for link in links])
+    # How many numbers arrive of each node's report, and bounds on the quantizers' errors.
     received = tuple(link.received(n) for link in links)
-    error = np.stack([q.error(n) for q in quantizers]) if quantizers else np.zeros((len(nodes), n))
+    error = np.stack([quantizer.error(n) for quantizer in quantizers]) if quantizers else np.zeros((len(nodes), n))
+    moments = [compute_channel_moments(channel) for channel in channels]
     return Uplinks(
-        groups=group_channels(named) if random else (),
+        groups=group_channels(channel_by_name) if is_random else (),
         quantizers=stack(quantizers) if quantizers else None,
-        links=_make_link_models([compute_channel_moments(channel) for channel in channels], received, error),
-        delay=np.stack([np.pad(link.delay, (0, ages - len(link.delay))) for link in links]),
+        links=_make_link_models(moments, received, error),
+        delay=delay,
         every=np.array([link.every for link in links], float),  # arguments of the program, which others share
         received=received,
         n=n,

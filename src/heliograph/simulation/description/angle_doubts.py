@@ -71,7 +71,7 @@ def _list_directions(filter: AbstractFilter) -> list[_Direction]:
 
 
 def _find_wide(direction: _Direction, deviation: Float[np.ndarray, "rows n"]) -> tuple[np.ndarray, list[int]]:
-    """Return the rows in which an angle, or an axis of an attitude, is too wide, and the states that are, in any row.
+    """Return the rows in which an angle, or an axis of an attitude, is too wide, and the states that are in some row.
 
     `deviation`: standard deviations of all states in each row.
     """
@@ -143,9 +143,12 @@ class WideAngles:
     def __init__(self, filter: AbstractFilter, names: Sequence[str] = ()):
         """Name the angles among the filter's states and received numbers; find the largest deviation it can use."""
         instance("filter", filter, AbstractFilter, "a filter")
-        angles = None if filter.claim == "none" else filter.angles_used()
-        self._directions, self._names = _list_directions(filter), filter.states
+        self._names = filter.states
+        # Angles and attitudes among the states that were not yet too wide, each with its largest usable deviation.
+        self._directions = _list_directions(filter)
         self.states = {i: filter.states[i] for direction in self._directions for i in direction.states}
+        # Angles among the received numbers, by index.
+        angles = None if filter.claim == "none" else filter.angles_used()
         if not isinstance(names, Sequence) or len(names) not in (0, filter.received):
             raise fail("names", f"those of {filter.received} received numbers", show_value(names))
         names = list(names) or [f"measurement[{i}]" for i in range(filter.received)]

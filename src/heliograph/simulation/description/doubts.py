@@ -16,9 +16,11 @@ from heliograph.model.assumed.same_plant_and_sensor import find_sensor_matrix
 from heliograph.model.channel_side_information import separate_told_numbers
 from heliograph.model.fading import memory_matters
 from heliograph.model.over_time import at_each_step, first
+from heliograph.model.sensor import AbstractSensor
 from heliograph.numerics.check import InputError, instance
 from heliograph.numerics.module import readable
 from heliograph.numerics.numpy_or_jax import DOUBLE
+from heliograph.numerics.types import Float
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.channel_state_information import list_told_maps
 from heliograph.random_affine.modes import redraw_modes_each_step
@@ -111,7 +113,8 @@ def _doubt_unobservable_states(network: Network) -> Iterator[Doubt]:
 
     They are the null space of the observability matrix, the derivatives of all outputs with respect to the state.
     """
-    # At a state drawn around the initial mean, since a symmetric point may hide what every other one shows.
+    # At a state drawn around the initial mean: at the mean itself, often a point of symmetry, a nonlinear sensor may
+    # have a derivative of zero that it has nowhere else.
     plant = first(network.plant)
     deviation = np.sqrt(np.diagonal(np.asarray(plant.initial_covariance)))
     state = np.asarray(plant.initial_mean) + deviation * np.random.default_rng(SEED).normal(size=len(plant.states))
@@ -119,7 +122,7 @@ def _doubt_unobservable_states(network: Network) -> Iterator[Doubt]:
     if not np.isfinite(matrix).all():
         yield Doubt(False, "observability: not judged, the derivatives of plant or sensors are no numbers")
         return
-    # Rows and then columns scaled to length 1, so that no unit matters; those of zeros stay.
+    # Rows (outputs) and then columns (states) scaled to length 1, so that no unit matters; those of zeros stay.
     row_lengths = np.linalg.norm(matrix, axis=1, keepdims=True)
     rows = matrix / np.where(row_lengths > 0, row_lengths, 1.0)
     column_lengths = np.linalg.norm(rows, axis=0)
@@ -171,42 +174,65 @@ def _doubt_error_bound(network: Network, what: str, serious: bool) -> Iterator[D
 
 
 def _has_undecided_senders(network: Network) -> bool:
-    """Return whether values decide what some node uses, or words stand for it: then all else is undecided."""
+    """Return whether at some node data decide what is used (trigger, limits), or codewords stand for numbers.
+
+    `certify_boundedness` is always undecided then, so that "undecided" is no news.
+    """
     return any(isinstance(node, Node) and node.disturbs_what_is_sent for node in network.nodes.values())
 
 
 def _doubt_useless_links(network: Network) -> Iterator[Doubt]:
-    """Yield doubts on sums of links whose mean gains cancel, and links of mean gain zero, useless to linear filters."""
+    """Yield doubts on links that add up at a node, z = sum_i G_i y_i + n, and are useless to a linear filter.
+
+    That is so of all together where their mean gains cancel, and of one whose mean gain is zero.
+    """
     for name, node in network.nodes.items():
-        if not isinstance(node, Node):
+        channel = first(node.channel) if isinstance(node, Node) else None
+        if not isinstance(node, Node) or not isinstance(channel, Superposed):
             continue
-        channel = first(node.channel)
-        if not isinstance(channel, Superposed):
-            continue
-        # E z = sum_i E[G_i] y_i, y_i the outputs that link i carries: by states where the sensor is a matrix.
-        links = [np.asarray(redraw_modes_each_step(link).moments(1).mean)[:-1, :-1] for link in channel.maps]
-        matrix = find_sensor_matrix(first(node.sensor)) if not channel.past else None
-        sensed = np.eye(channel.inputs) if matrix is None else np.asarray(matrix)
-        heard = [mean @ sensed[list(outputs)] for mean, outputs in zip(links, channel.places, strict=True)]
-        if not np.any(np.abs(sum(heard)) > CANCELLED * sum(np.abs(mean) for mean in heard)):
+        gains = [_compute_mean_gain(link) for link in channel.maps]
+        if _do_gains_cancel(channel, gains, first(node.sensor)):
             advice = "a linear filter learns nothing of it; compensate phases and signs at the transmitters"
             yield Doubt(serious=True, words=f"unheard: what adds up at {name!r} has mean gain 0: {advice}")
             continue
-        silent = [f"link{i}" for i, mean in enumerate(links, 1) if not np.any(mean)]
+        silent = [f"link{i}" for i, gain in enumerate(gains, 1) if not np.any(gain)]
         if silent:
             yield Doubt(False, f"unheard: {join_names(silent)} at {name!r}: of mean gain 0, which only adds noise")
+
+
+def _compute_mean_gain(link: AbstractRandomAffine) -> Float[np.ndarray, "m p"]:
+    """Return E[G] of a link z = G y + n, over its fading and, where its modes have memory, over their long-run law."""
+    mean = np.asarray(redraw_modes_each_step(link).moments(1).mean)  # [E G, E n; 0, 1]
+    return mean[:-1, :-1]
+
+
+def _do_gains_cancel(channel: Superposed, gains: list[Float[np.ndarray, "m p"]], sensor: AbstractSensor) -> bool:
+    """Return whether sum_i E[G_i] C_i = 0 up to rounding, so that the mean of z = sum_i G_i C_i x + n shows no state.
+
+    C_i are the rows of the sensor's matrix C that link i carries (`channel.places`). Where the sensor is not linear, or
+    the channel is late and so carries past signals too, C = I: it is judged by signals and not by states.
+
+    Args:
+        channel: the sum of links.
+        gains: E[G_i] of each link.
+        sensor: what measures the signals.
+    """
+    is_late = channel.past > 0
+    matrix = None if is_late else find_sensor_matrix(sensor)
+    sensed = np.eye(channel.inputs) if matrix is None else np.asarray(matrix)  # C
+    heard = [gain @ sensed[list(outputs)] for gain, outputs in zip(gains, channel.places, strict=True)]
+    return not np.any(np.abs(sum(heard)) > CANCELLED * sum(np.abs(mean) for mean in heard))
 
 
 def _doubt_declared_noise(network: Network) -> Iterator[Doubt]:
     """Yield a line on the nodes whose messages declare the variance of their noise, which filters take for true."""
     names = []
     for name, node in network.nodes.items():
-        told_filters = (
-            [filter for filter in node.filters.values() if isinstance(filter, ToldFilter)]
-            if isinstance(node, Node)
-            else []
-        )
-        if any(list_links_declaring_noise(filter) for filter in told_filters):
+        if not isinstance(node, Node):
+            continue
+        # A ToldFilter uses numbers that come with each message, such as this variance.
+        filters_using_numbers = [filter for filter in node.filters.values() if isinstance(filter, ToldFilter)]
+        if any(list_links_declaring_noise(filter) for filter in filters_using_numbers):
             names.append(name)
     if names:
         senders = join_names([repr(name) for name in names])
@@ -237,7 +263,7 @@ def _doubt_mistaken_beliefs(network: Network) -> Iterator[Doubt]:
     doubt is serious if the filter's claim of its covariance was lowered to "nominal" for this.
     """
     beliefs_by_line: dict[tuple[bool, str, tuple[str, ...]], list[MistakenBelief]] = {}
-    # For each filter the nodes where it ignores the memory of their links: another doubt tells of these.
+    # For each filter the nodes where it ignores the memory of their links: `_doubt_forgetful_filters` tells of these.
     nodes_with_ignored_memory = _list_forgetful_nodes(network)
     for belief in yield_mistaken_beliefs(network):
         if belief.parts == (CHANNEL,) and belief.node in nodes_with_ignored_memory.get(belief.filter, ()):
@@ -288,6 +314,10 @@ def _list_forgetful_nodes(network: Network) -> dict[str, list[str]]:
 
 
 def _ignores_memory(filter: AbstractFilter) -> bool:
-    """Return whether a filter, or the one that it wraps, has no model of memory."""
+    """Return whether a filter takes its link's gains for independent over time, though they may be correlated.
+
+    Filters of these two classes do: their state has no part for the channel's mode, which carries its memory from step
+    to step. Judged is a filter, or the one inside it where it wraps another (`base`).
+    """
     inner = getattr(filter, "base", filter)
     return isinstance(inner, GaussianFilter | LinearFilter)

@@ -16,10 +16,12 @@ from heliograph.simulation.node import Node
 
 
 def list_sensors(network: Network) -> list[AbstractSensor]:
-    """Return every sensor of the network, at its first step."""
+    """Return every sensor of the network, at its first step: of the nodes, common to all nodes, or behind relays."""
     sensors = [node.sensor for node in network.nodes.values() if isinstance(node, Node)]
-    sensors += [] if network.common is None else [network.common.sensor]
-    sensors += [] if network.relays is None else [network.relays.sensor]
+    if network.common is not None:
+        sensors.append(network.common.sensor)
+    if network.relays is not None:
+        sensors.append(network.relays.sensor)
     return [first(sensor) for sensor in sensors]
 
 

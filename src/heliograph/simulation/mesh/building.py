@@ -32,7 +32,7 @@ def build_mesh(network: Network, name: str) -> Mesh:
     for part in graph.buckets():
         members, width = part.senders[:, 0], part.senders.shape[1]
         buckets.append(NodeBucket(rule=fusion.rule.placed(part), rows=members, width=width))
-    # Place of each node among the results of all buckets, one after another: the inverse of the order of the members.
+    # Place of each node among the results of all buckets, which are joined one after another.
     ranks = np.argsort(np.concatenate([bucket.rows for bucket in buckets]))
     # For each group of nodes of one structure that has the mesh's estimates: the numbers of its nodes in the mesh.
     index = {node: i for i, node in enumerate(nodes)}
@@ -74,12 +74,13 @@ def _model_measurements(network: Network, nodes: Sequence[str]) -> SeparateObser
 
 
 def build_meshes(network: Network) -> dict[str, Mesh]:
-    """Return the network's fusions between neighbours by name, ready to be stepped.
+    """Return the network's fusions between neighbours (meshes) by name, ready to be stepped.
 
     Raises:
-        ValueError: too many nodes for a rule that follows the joint covariance of their errors.
+        ValueError: more than DENSE nodes with a rule that needs the joint covariance of all their errors at every step.
+            The message names two ways out: `freeze`, which takes a mean of that covariance once and for all, and rules
+            of covariance intersection, which do without it.
     """
-    # DENSE: the most nodes whose joint covariance is propagated.
     for name, fusion in network.meshes.items():
         nodes = len(network.mesh_nodes(name))
         if fusion.rule.needs_joint and nodes > DENSE:

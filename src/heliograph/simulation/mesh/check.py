@@ -227,8 +227,8 @@ def _check_losses(what: str, fusion: Fusion, network: HasNodes, graph: Graph) ->
     rates = [find_loss_decay(channel) for channel in links_by_edge(link, graph).values()]
     if any(rate is None for rate in rates):
         return
-    # Capacities -log p in whole units, as the search for a flow needs them; at most WIDEST, as good as infinite, of an
-    # edge that loses nothing.
+    # Capacities -log p (1e-300 in place of p = 0) in whole units of 1 / UNIT, as the search for a flow needs them. An
+    # edge that loses nothing has the capacity WIDEST, as good as infinite.
     exact = np.array([-np.log(max(float(rate or 0.0), 1e-300)) for rate in rates])
     capacities = np.minimum(np.round(UNIT * exact), WIDEST).astype(np.int32)
     # For each unstable mode: the least cut between the nodes that observe it and each other node.
@@ -237,7 +237,8 @@ def _check_losses(what: str, fusion: Fusion, network: HasNodes, graph: Graph) ->
         if abs(value) <= 1 + MODE:
             continue
         sees = np.array([_measures_mode(network.nodes[name], vector) for name in names])
-        # One node more, the source, with an edge to each node that measures the mode: too wide for a least cut.
+        # The graph with one node more, the source, and from it an edge to each node that measures the mode. No least
+        # cut takes these edges, whose capacity UNCUT is above all others.
         source = len(names)
         senders = np.concatenate([graph.edges[:, 0], np.full(sees.sum(), source)])
         receivers = np.concatenate([graph.edges[:, 1], np.flatnonzero(sees)])
@@ -336,18 +337,20 @@ def _check_fixed_shares(what: str, fusion: Fusion, network: HasNodes, graph: Gra
         return
     a, q = np.asarray(plant.matrix), np.asarray(plant.noise_covariance(jnp.zeros(len(plant.inputs))))
     nodes = [network.nodes[name] for name in names]
-    # Judged where the plant does not decay, each edge's losses are independent over steps, and nodes are steady.
+    # Judged where the plant does not decay, each edge's losses are independent over steps (so that a message has one
+    # probability to arrive, which is None else), and nodes measure by one law at every step.
     links = [None] * len(graph.edges) if link is None else list(links_by_edge(link, graph).values())
-    rates = [find_arrival_probability(channel) for channel in links]
-    arrival = np.array([p for p in rates if p is not None])
-    steady = all(_measures_alike_at_each_step(node) for node in nodes if isinstance(node, Node))
-    if np.abs(np.linalg.eigvals(a)).max() < 1 - MODE or len(arrival) < len(rates) or not steady:
+    probabilities = [find_arrival_probability(channel) for channel in links]
+    arrival = np.array([p for p in probabilities if p is not None])
+    are_independent = len(arrival) == len(probabilities)
+    is_decaying = np.abs(np.linalg.eigvals(a)).max() < 1 - MODE
+    are_steady = all(_measures_alike_at_each_step(node) for node in nodes if isinstance(node, Node))
+    if is_decaying or not are_independent or not are_steady:
         return
-    # A node without a sensor measures zeros, with a noise that does not matter.
-    models = [
-        _get_gain_and_noise(node) if isinstance(node, Node) else (np.zeros((1, len(a))), np.eye(1)) for node in nodes
-    ]
-    squares = np.array([h.T @ np.linalg.solve(noise, h) for h, noise in models])
+    # H' R^-1 H of each node. One without a sensor measures zeros, with a noise that does not matter.
+    nothing = np.zeros((1, len(a))), np.eye(1)
+    models = [_get_gain_and_noise(node) if isinstance(node, Node) else nothing for node in nodes]
+    squares = np.array([h.T @ np.linalg.solve(r, h) for h, r in models])
     shares = np.asarray(fusion.rule.placed(graph).shares).T
     check_error_decay(what, graph, shares, arrival, (a, q), squares)
 

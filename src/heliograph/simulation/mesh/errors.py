@@ -161,6 +161,7 @@ def propagate_errors_over_time(
     with jax.enable_x64(True):
         start = to_numpy(mesh.init())
     # Before any data all nodes have the same error, x_0 - E x_0: every block of the joint covariance J is Cov x_0.
+    # `moments`: mean and covariance of the plant's state x before any data; `covariance`: what rules weigh by.
     covariance, moments = start.covariance, start.plant
     _, initial_covariance = start.plant
     count, n = start.mean.shape

@@ -82,7 +82,7 @@ class Mesh(Module):
 
     @property
     def has_long_step(self) -> bool:
-        """Return whether a step has more than MESH operations, which is too many to write out as native code."""
+        """Whether a step has more than MESH operations: too many to write out one by one as native code."""
         n = len(first(self.plant).states)
         # About n^2 operations for each message, and 2 N^2 for a joint covariance of N = (number of nodes) n numbers.
         messages = self.edges.rounds * int(np.count_nonzero(self.edges.present))

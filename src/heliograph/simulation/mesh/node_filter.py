@@ -178,14 +178,14 @@ def node_filter(network: Network, fusion: str, node: str) -> NodeFilter:
     # The graph of this node alone: itself first, then its neighbours, which only send.
     mesh = _build_one_node_mesh(network, fusion, node)
     # The filter receives the node's own measurement, then a message of each neighbour: the neighbour's mean (n),
-    # covariance (n, n) and measurement.
-    sizes = tuple(network.nodes[name].received for name in mesh.nodes)
-    own, *of_neighbours = sizes
+    # covariance (n, n) and measurement. `measured_by`: how many numbers the node and each neighbour measure.
+    measured_by = tuple(network.nodes[name].received for name in mesh.nodes)
+    own, *of_neighbours = measured_by
     filter = NodeFilter(
         mesh=mesh,
-        measured=sizes,
-        quantizer=next(iter(between.quantizers((node,))), None),
-        receivers=tuple(name for name in nodes if node in (between.neighbours or {})[name]),
+        measured=measured_by,
+        quantizer=next(iter(between.quantizers((node,))), None),  # the node's own, if it has one
+        receivers=tuple(name for name in nodes if node in (between.neighbours or {})[name]),  # whose neighbour it is
         claim=mesh.claim,
         states=network.states,
         inputs=network.inputs,

@@ -125,16 +125,24 @@ class JudgementReader:
     ) -> Float[np.ndarray, "... filters 4"]:
         """Return the judgements of these filters, followed by those of the central filters if `central` is True.
 
-        `indices`: (stack, filter, node) of each filter in the stacked outputs. The result has the recording's axes,
-        then filters, then the fields of a Judgement.
+        The result has the recording's axes (such as steps), then filters, then the four fields of a `Judgement`:
+        distance, arrived, reason and input.
+
+        Args:
+            outputs: "judged", by stack, judgements whose fields are (..., filter, node); "judged_centrally" by name of
+                the central filter, judgements whose fields are (...).
+            indices: where each filter stands in the stacked outputs: (stack, filter, node).
+            central: whether the central filters' follow.
         """
-        judgements = [
-            [field[..., index.filter, index.node] for field in outputs["judged"][index.stack]] for index in indices
-        ]
-        judgements += [list(judgement) for judgement in outputs["judged_centrally"].values()] if central else []
+        judgements = []  # of each filter a list of four arrays (...)
+        for index in indices:
+            judgements.append([field[..., index.filter, index.node] for field in outputs["judged"][index.stack]])
+        if central:
+            judgements += [list(judgement) for judgement in outputs["judged_centrally"].values()]
         if not judgements:
             return np.zeros((0, len(Judgement._fields)))
-        return np.moveaxis(np.array(judgements), (0, 1), (-2, -1))
+        by_filter_and_field = np.array(judgements)
+        return np.moveaxis(by_filter_and_field, (0, 1), (-2, -1))
 
     @property
     def nodes_without_judge(self) -> list[str]:
@@ -165,8 +173,14 @@ def find_refused_rows(
 
 
 def _list_rows_refused_by_all(votes: Float[np.ndarray, "steps filters 4"]) -> dict[int, str]:
-    """Return the rows whose values all these filters refuse, with the reason."""
-    reasons_by_row = {row: Judgement.why_values(votes[row]) for row in _find_flagged(votes, "reason")}
+    """Return the rows whose values all these filters refuse, with the reason in words.
+
+    `votes`: the filters' judgements of each row; the last axis has the four fields of a `Judgement`: distance, arrived,
+    reason and input. A filter refuses a row where its reason, a code, is above 0. `Judgement.why_values` puts the
+    reason in words, and is None where some filter accepts the row.
+    """
+    rows_refused_by_some = _find_flagged(votes, "reason")
+    reasons_by_row = {row: Judgement.why_values(votes[row]) for row in rows_refused_by_some}
     return {row: reason for row, reason in reasons_by_row.items() if reason}
 
 

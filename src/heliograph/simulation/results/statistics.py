@@ -203,8 +203,8 @@ def expand_pairs(pairs: np.ndarray) -> np.ndarray:
 def pool(statistics: Sequence[ErrorStatistics]) -> ErrorStatistics:
     """Pool the statistics of several nodes, their steps joined: means run over nodes as over steps.
 
-    Means and rates then have standard errors over runs: runs stay the unit of independence, so that errors that nodes
-    share are not counted as independent ones.
+    So nodes are averaged like steps, and not like runs: errors that nodes share do not count as independent, and
+    standard errors come from the scatter between runs alone.
 
     Args:
         statistics: one for each node, of the same runs: sums by batch of runs and step (batch, steps, ...) of error
@@ -216,17 +216,20 @@ def pool(statistics: Sequence[ErrorStatistics]) -> ErrorStatistics:
     nodes = items("pooled statistics", statistics, "ErrorStatistics")
     for of_node in nodes:
         instance("pooled statistics", of_node, ErrorStatistics, "ErrorStatistics")
-    # Statistics of the same runs have equal counts of runs in each batch. Join the steps; the weakest claim holds.
+    # Statistics of the same runs have equal counts of runs in each batch.
     if not nodes or any(not np.array_equal(s.count, nodes[0].count) for s in nodes):
         raise fail("pooled statistics", "statistics of the same runs", f"{len(nodes)} that differ")
+    # Runs that failed at each step of each node; where none were counted, none failed.
+    failed = [np.zeros(s.nees.shape[1]) if s.failed is None else s.failed for s in nodes]
+    steps = 1  # the axis of steps in sums (batch, steps, ...)
     return ErrorStatistics(
         count=nodes[0].count,
-        pairs=np.concatenate([s.pairs for s in nodes], axis=1),
-        claimed_pairs=np.concatenate([s.claimed_pairs for s in nodes], axis=1),
-        nees=np.concatenate([s.nees for s in nodes], axis=1),
-        claim=weakest([s.claim for s in nodes]),
-        failed=np.concatenate([np.zeros(s.nees.shape[1]) if s.failed is None else s.failed for s in nodes]),
-        failed_runs=max(s.failed_runs for s in nodes),
+        pairs=np.concatenate([s.pairs for s in nodes], axis=steps),
+        claimed_pairs=np.concatenate([s.claimed_pairs for s in nodes], axis=steps),
+        nees=np.concatenate([s.nees for s in nodes], axis=steps),
+        claim=weakest([s.claim for s in nodes]),  # what holds of all: "exact" is stronger than "upper", "nominal"
+        failed=np.concatenate(failed),
+        failed_runs=max(s.failed_runs for s in nodes),  # runs that failed at some step, of the worst node
     )
 
 
@@ -249,7 +252,7 @@ class WorstDirection:
 
     @property
     def z(self) -> float:
-        """Excess of the ratio over 1 in standard errors."""
+        """Excess of the ratio, of the actual variance to the claimed one, over 1 in standard errors; 0 without any."""
         return (self.ratio - 1) / self.standard_error if self.standard_error else 0.0
 
 

@@ -87,7 +87,10 @@ class RowLayout(NamedTuple):
         return self.state.size + self.received + self.inputs + 1
 
     def split_row(self, row: jax.Array) -> tuple[PyTree, jax.Array, jax.Array, jax.Array]:
-        """Return the filters' states, measurements, inputs and step number, which stand side by side in a row."""
+        """Return the states of all filters, the measurements of all nodes, the inputs and the step number of a row.
+
+        They stand side by side in it: `self.received` measurements, `self.inputs` inputs.
+        """
         state, data_of_row = row[: self.state.size], row[self.state.size :]
         z, u = data_of_row[: self.received], data_of_row[self.received : self.received + self.inputs]
         k = data_of_row[-1].astype(np.int64)
@@ -293,7 +296,9 @@ def _make_step(layout: RowLayout) -> Any:
 def _make_row_function(layout: RowLayout) -> Any:
     """Return the function (numbers, row) -> row of states and outputs; equal layouts get the same function.
 
-    `numbers`: the arrays of a network's step. `layout`: everything else of it, and where the parts of a row stand.
+    It is `_make_step` of this layout, with its results side by side in one array, as compiled code puts them out.
+    `numbers` are the arrays of a network's step, such as its models' matrices. `layout`: everything else of the step,
+    and where states, measurements, inputs and the step's number stand in a row.
     """
 
     def step(numbers: list[jax.Array], row: jax.Array) -> jax.Array:

@@ -140,8 +140,14 @@ class LateChannelState(NamedTuple):
 def start_channel(channel: Channel, key: jax.Array, source: Number, shared: MemoryNumbers) -> PyTree:
     """Return a channel's state before the first step of the run with this key.
 
-    A channel that delivers late also keeps past signals, which are zeros here. `source`: the number that seeds its own
-    draws. `shared`: the numbers that seed those of its memories.
+    The state has that of the channel's memories, such as fading or a Markov chain of losses. A channel that delivers
+    late also keeps the signals of its last `past` steps, which are zeros here.
+
+    Args:
+        channel: a link, or one for each step.
+        key: key of the run.
+        source: number that seeds the link's own draws.
+        shared: numbers that seed the draws of its memories, one for each: links with a memory of one number share it.
     """
     link, link_key = at(channel, k=0), draw_key(key, k=0, source=source, purpose=CHANNEL_START)
     keys = [draw_key(key, k=0, source=memory, purpose=MEMORY_START) for memory in shared]
