@@ -109,9 +109,9 @@ class AllFilters(Module):
     def init(self) -> PyTree:
         """Return the states before the first step, as a tuple of six entries.
 
-        They are the states of: the nodes' filters, by stack; central filters, by
-        name; quantizers of the nodes' estimates, by stack of fusions; centres that propagate the joint covariance of
-        the nodes' errors; fusions of reports and between neighbours, by name; and fused estimates that are tested.
+        They are the states of: the nodes' filters, by stack; filters of all measurements, by name; quantizers of the
+        nodes' estimates, by stack of fusions; centres that propagate the joint covariance of the nodes' errors; fusions
+        of reports and between neighbours, by name; and fused estimates that are tested.
         """
         central = {name: initial_state(filter) for name, filter in self.central.items()}
         states = tuple(stacked.init() for stacked in self.stacks)
@@ -139,8 +139,8 @@ class AllFilters(Module):
     @property
     def are_linear_and_unfused(self) -> bool:
         """Whether all filters are linear with gains that depend on no data, and none of their estimates is fused."""
+        are_fused = bool(self.fusions or self.centres or self.reporting or self.meshes)
         filters = [*(stacked.filters for stacked in self.stacks), *self.central.values()]
-        are_fused = self.fusions or self.centres or self.reporting or self.meshes
         return not are_fused and all(filter.is_linear for filter in filters)
 
     @property
@@ -161,7 +161,7 @@ class AllFilters(Module):
         return matrices
 
     def step_without_data(self, states: PyTree, u: jax.Array, k: jax.Array) -> PyTree:
-        """Return the states of the nodes' filters by stack after step k with measurements of zero, for their gains."""
+        """Return the filters' states, by stack, after step k with measurements of zero, for their gains."""
         numbered = enumerate(zip(self.stacks, states, strict=True))
         return tuple(stacked.step(state, self._make_zeros(stack), u, k)[0] for stack, (stacked, state) in numbered)
 
@@ -259,9 +259,9 @@ class AllFilters(Module):
 
         An entry is (field of `StepOutput`, name of the output for the nodes' filters, name for central filters).
         """
+        for_smoothing = [("steps", "smoother_steps", "central_steps")]
         judgements = [("judgement", "judged", "judged_centrally"), ("weighed", "weighed", "weighed_centrally")]
-        steps = [("steps", "smoother_steps", "central_steps")]
-        return (steps if self.smooths else []) + (judgements if self.judges else [])
+        return (for_smoothing if self.smooths else []) + (judgements if self.judges else [])
 
     def _step_fusions(
         self,

@@ -40,7 +40,11 @@ def find_estimate_indices(
 
 
 def group_by_structure(items: Iterable[tuple[str, object]]) -> tuple[tuple[str, ...], ...]:
-    """Return the names in groups, in order of first appearance; models of one group differ only in their numbers."""
+    """Return the names of models of one structure together, in order of first appearance.
+
+    Models of one structure differ in the numbers of their arrays alone, so that arrays stack and one program serves
+    all.
+    """
     names_by_structure: dict[object, list[str]] = {}
     for name, model in items:
         names_by_structure.setdefault(structure_key(model), []).append(name)

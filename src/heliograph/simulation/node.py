@@ -170,7 +170,7 @@ class Node(Module):
         output that the channel carries, but not for a flag, which tells the channel's mode.
         """
         channel = first(self.channel)
-        if self.encoder is None or not self.encoder.subtracts:
+        if self.encoder is None or not self.encoder.subtracts:  # no dithers arrive
             side_information = self.received - channel.outputs
             return name_received_values(self.outputs, channel, side_information)
         carried_outputs = [output for output in find_carried_components(channel) if output != FLAG]

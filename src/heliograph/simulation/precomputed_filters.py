@@ -69,8 +69,9 @@ def _precompute_all_by_xla(filters: AbstractFilter, u: Array, smooths: bool, cou
 def can_precompute(filters: AllFilters) -> bool:
     """Return whether some filter has anything to precompute.
 
-    `AbstractFilter.planned` returns the filter itself; a class with gains that depend on no data overrides it, to
-    return the filter with these gains computed.
+    Looked at are the stacked filters of the nodes, and those of all measurements. `AbstractFilter.planned` returns the
+    filter itself; a class with gains that depend on no data overrides it, to return the filter with these gains
+    computed.
     """
     all_filters = [*(stacked.filters for stacked in filters.stacks), *filters.central.values()]
     return any(type(filter).planned is not AbstractFilter.planned for filter in all_filters)

@@ -118,7 +118,11 @@ class CrossCovariances:
         )
 
     def _check_relays(self, relays: Mapping[str, Sequence[str]]) -> None:
-        """Raise ValueError unless each relay receives some of the nodes, and no node has two relays."""
+        """Raise ValueError unless each relay receives some of the nodes, and no node has two relays.
+
+        `relays`: names of the nodes that each relay receives. A node with two relays would make their errors dependent
+        in a way that the factors do not hold.
+        """
         received_nodes = [name for names in relays.values() for name in names]
         unknown = sorted(set(received_nodes) - set(self.nodes))
         if not relays or unknown or not all(relays.values()):
@@ -208,6 +212,9 @@ def fused_covariances(
 def _plan_network_filters(network: Network, horizon: int, inputs: ArrayLike | None) -> tuple[AllFilters, np.ndarray]:
     """Return the network's filters, planned for the inputs, and the inputs (horizon, inputs).
 
+    An informed fusion is one by a rule that needs the joint covariance of the nodes' errors. Everything that depends on
+    no data, such as gains, is computed ahead.
+
     Raises:
         ValueError: no informed fusion, senders that decide when to transmit, or filters whose gains depend on data.
     """
@@ -247,12 +254,17 @@ def _compute_joint_error_factors(filters: AllFilters, u: np.ndarray) -> SourceFa
 
 @quickly_compiled
 def _compute_fused_covariances(filters: AllFilters, u: np.ndarray) -> PyTree:
-    """Return the covariances (time, n, n) of all fused estimates, by name, over the steps of u."""
+    """Return the covariances (time, n, n) of all fused estimates, by name, over the steps of u.
+
+    Gains depend on no data, so that covariances are propagated alone: those of the nodes' filters, whose gains they
+    give, and with these gains the joint covariance of all errors in each fusion centre.
+    """
 
     def step(carry: tuple[PyTree, PyTree], row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
         """Step all covariances: of the nodes' filters, and of the centres by these filters' matrices.
 
-        Covariances do not depend on data, so means are taken as 0.
+        Covariances do not depend on data, so means are taken as 0. `centre.sources`: (stack, number in it) of each
+        filter that a centre fuses; a stack has filters that differ in numbers alone.
         """
         states, centre_states = carry
         k, u_k = row

@@ -115,8 +115,9 @@ class StackedFusions(Module):
     def _gather_by_fusion(self, values_by_stack: Sequence[jax.Array | np.ndarray]) -> jax.Array:
         """Return values of the filters as (fusion, node, ...), in the order of each fusion's nodes.
 
-        `values_by_stack`: (filter, node, ...) for each stack of filters. `self.sources`: for each fusion, the pairs
-        (stack, filter) that it fuses. `self.order`: for each fusion, the order of their joined rows.
+        `values_by_stack`: (filter, node, ...) for each stack of filters of one structure. `self.sources`: for each
+        fusion, the pairs (stack, number of the filter in it) that it fuses. `self.order`: for each fusion, the order of
+        their joined rows.
         """
         values_by_fusion = [
             jnp.concatenate([values_by_stack[stack][filter] for stack, filter in sources]) for sources in self.sources
@@ -278,6 +279,9 @@ def _stack_fusions(
     """Return the fusions of these names, of one structure, stacked.
 
     `indices_by_filter`: of all estimates, by (node, filter). `claims`: of each fusion.
+
+    A claim is what a covariance is said to be: exact, an upper bound, or nominal. `fusion.uplinks`: the quantizers
+    through which a node's estimate is sent, or None.
     """
     fusions = [fusion for fusion in (network.fused[name] for name in names) if isinstance(fusion, Fusion)]
     sources, orders, quantizers = [], [], []

@@ -92,7 +92,8 @@ def _name_reports(network: Network, fusion: Fusion) -> list[str]:
     nodes = network.nodes_with(fusion.filter)
     uplinks = build_uplinks(fusion, nodes, len(network.states))
     names = []
-    for age in range(uplinks.delay.shape[1]):
+    ages = uplinks.delay.shape[1]
+    for age in range(ages):
         suffix = f"_{age}_late" if age else ""  # age: steps between sending and arrival
         for node, link, size in zip(nodes, fusion.links(nodes), uplinks.received, strict=True):
             numbers = network.states if link.channel is None else [f"report{i}" for i in range(size)]

@@ -97,7 +97,11 @@ class Uplinks(Module):
         return np.flatnonzero(np.broadcast_to(is_number, (ages, *is_number.shape)))
 
     def init(self) -> ReportsInTransit:
-        """Return the state with no report in transit from the nodes to the centre."""
+        """Return the state with no report in transit from the nodes to the centre.
+
+        It has a row for each age of 1, 2, ... steps that a report can reach on its way, and the initial states of the
+        quantizers, by which nodes send reports in few bits.
+        """
         nodes, ages = self.delay.shape
         values = jnp.full((ages - 1, nodes, max(self.received)), jnp.nan)  # NaN: nothing was sent
 
@@ -243,7 +247,8 @@ class Uplinks(Module):
 def _draw_links(group: ChannelGroup, delay: jax.Array, key: jax.Array, k: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Draw the matrices [G n; 0 1] (channel, m + 1, n + 1) of a group's channels at step k, and their delays in steps.
 
-    G: the gain. n: the offset with its noise. `delay` (channel, ages): the probability of each delay.
+    A group has the channels of some nodes, of one structure, stacked. G: the gain. n: the offset with its noise.
+    `delay` (channel, ages): the probability of each delay.
     """
 
     def draw_link(channel: Channel, source: jax.Array, probabilities: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -257,7 +262,11 @@ def _draw_links(group: ChannelGroup, delay: jax.Array, key: jax.Array, k: jax.Ar
 
 
 def build_uplinks(fusion: Fusion, nodes: Sequence[str], n: int) -> Uplinks:
-    """Return the uplinks of these nodes to the centre of a fusion by reports of n numbers."""
+    """Return the uplinks of these nodes to the centre of a fusion by reports of n numbers.
+
+    A node's report is its estimate of n numbers; on its way to the centre it may be rounded by a quantizer, and scaled,
+    lost or delayed by a random channel.
+    """
     links, quantizers = fusion.links(nodes), fusion.quantizers(nodes)
     channels = [perfect(n) if link.channel is None else link.channel for link in links]
     # Nothing is drawn if no link has a channel, and each has one delay of probability 1.
@@ -269,9 +278,10 @@ def build_uplinks(fusion: Fusion, nodes: Sequence[str], n: int) -> Uplinks:
     # How many numbers arrive of each node's report, and bounds on the quantizers' errors.
     received = tuple(link.received(n) for link in links)
     error = np.stack([quantizer.error(n) for quantizer in quantizers]) if quantizers else np.zeros((len(nodes), n))
+    groups = group_channels(channel_by_name) if is_random else ()
     moments = [compute_channel_moments(channel) for channel in channels]
     return Uplinks(
-        groups=group_channels(channel_by_name) if is_random else (),
+        groups=groups,
         quantizers=stack(quantizers) if quantizers else None,
         links=_make_link_models(moments, received, error),
         delay=delay,

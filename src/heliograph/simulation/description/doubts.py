@@ -69,32 +69,35 @@ def doubts_before_data(network: Network) -> list[Doubt]:
         ValueError: what is no network.
     """
     instance("network", network, Network, "a Network")
-    # Serious: states that no sensor observes, errors without a bound, links that carry nothing, filters that ignore a
-    # link's memory, filters that assume other models than the true ones, angles.
-    lines = [*_doubt_unobservable_states(network), *_doubt_boundedness(network), *_doubt_useless_links(network)]
-    lines += [*_doubt_forgetful_filters(network), *_doubt_mistaken_beliefs(network)]
-    lines += [Doubt(True, words) for words in (*doubt_wide_angles_at_start(network), *doubt_degrees_at_start(network))]
-    # Good to know: lost digits, links that fail together, slow computation, noise that messages declare, and nodes that
-    # are independent of each other.
-    lines += [Doubt(False, f"digits: {words}; make tables {DOUBLE}") for words in list_rounded_numbers(network)]
-    lines += [Doubt(False, f"shared, so that losses come together: {words}") for words in list_shared_in_words(network)]
-    lines += [Doubt(False, f"by XLA, which takes longer: {words}") for words in explain_xla_fallbacks(network)]
+    # States that no sensor observes, errors without a bound, links that carry nothing, filters that ignore a link's
+    # memory, filters that assume other models than the true ones.
+    doubts = [*_doubt_unobservable_states(network), *_doubt_boundedness(network), *_doubt_useless_links(network)]
+    doubts += [*_doubt_forgetful_filters(network), *_doubt_mistaken_beliefs(network)]
+    # In words alone: serious ones on angles; then lost digits, links that fail together, and slow computation.
+    serious = [*doubt_wide_angles_at_start(network), *doubt_degrees_at_start(network)]
+    notes = [f"digits: {words}; make tables {DOUBLE}" for words in list_rounded_numbers(network)]
+    notes += [f"shared, so that losses come together: {words}" for words in list_shared_in_words(network)]
+    notes += [f"by XLA, which takes longer: {words}" for words in explain_xla_fallbacks(network)]
     if sequential := describe_sequential_filters(network):
-        lines.append(
-            Doubt(False, f"row by row however long a recording is, since not linear in its data: {sequential}")
-        )
-    lines += [
-        *_doubt_declared_noise(network),
-        *_doubt_told_numbers_without_claim(network),
-        *_doubt_overloaded_words(network),
-    ]
+        notes.append(f"row by row however long a recording is, since not linear in its data: {sequential}")
+    doubts += [Doubt(serious=True, words=words) for words in serious]
+    doubts += [Doubt(serious=False, words=words) for words in notes]
+    # Noise that messages declare, links that report what is not the whole truth, words of few bits.
+    doubts += [*_doubt_declared_noise(network), *_doubt_told_numbers_without_claim(network)]
+    doubts += [*_doubt_overloaded_words(network), *_doubt_independent_nodes(network)]
+    return sorted(doubts, key=lambda doubt: not doubt.serious)
+
+
+def _doubt_independent_nodes(network: Network) -> Iterator[Doubt]:
+    """Yield a line if nodes measure states that nothing couples: each part could be a network of its own.
+
+    Parts that are estimated together cost more than apart, and estimate nothing better.
+    """
     parts = separate_nodes(network)
     if len(parts) > 1:
         words = f"independent: nothing couples what {join_names([repr(names[0]) for names in parts])} measure"
-        lines.append(
-            Doubt(False, f"{words}; a plant of each, a fleet, is estimated as well, starts sooner, costs less")
-        )
-    return sorted(lines, key=lambda doubt: not doubt.serious)
+        advice = "a plant of each, a fleet, is estimated as well, starts sooner, costs less"
+        yield Doubt(serious=False, words=f"{words}; {advice}")
 
 
 def _doubt_overloaded_words(network: Network) -> Iterator[Doubt]:
@@ -138,7 +141,11 @@ def _doubt_unobservable_states(network: Network) -> Iterator[Doubt]:
 
 
 def _doubt_boundedness(network: Network) -> Iterator[Doubt]:
-    """Yield what is known before data on whether errors stay bounded: of all nodes together, and of each alone."""
+    """Yield what is known before data on whether errors stay bounded: of all nodes together, and of each alone.
+
+    Where nodes are many, more than NODES_LIMIT, each alone is not judged. A node's own error that grows is serious only
+    where nothing is fused, as the node is then all that there is.
+    """
     # All nodes together, then each that has filters.
     yield from _doubt_error_bound(network, "the mean error of every filter", serious=True)
     nodes_with_filters = [name for name, node in network.nodes.items() if isinstance(node, Node) and node.filters]
@@ -225,7 +232,11 @@ def _do_gains_cancel(channel: Superposed, gains: list[Float[np.ndarray, "m p"]],
 
 
 def _doubt_declared_noise(network: Network) -> Iterator[Doubt]:
-    """Yield a line on the nodes whose messages declare the variance of their noise, which filters take for true."""
+    """Yield a line on the nodes whose messages declare the variance of their noise, which filters take for true.
+
+    A message may bring the variance of its own noise beside its value. Whether such variances are true shows only in
+    data.
+    """
     names = []
     for name, node in network.nodes.items():
         if not isinstance(node, Node):

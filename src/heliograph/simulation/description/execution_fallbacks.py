@@ -47,7 +47,11 @@ def _list_filters(network: Network) -> Iterator[tuple[str, AbstractFilter]]:
 
 
 def _find_refused_filters(network: Network) -> Iterator[tuple[str, str]]:
-    """Yield (name, reason) for each filter whose step native code refuses, so that XLA computes it."""
+    """Yield (name, reason) for each filter whose step native code refuses, so that XLA computes it.
+
+    Native code is the library's own compiler of straight-line code, faster than XLA; it does not know every operation.
+    The step is traced with zeros, which have the shapes of any data.
+    """
     for name, filter_with_names in _list_filters(network):
         filter = without_output_names(filter_with_names)  # so that filters of one structure are compiled once
         z, u = np.zeros(filter.received), np.zeros(len(filter.inputs))
@@ -62,7 +66,10 @@ def _step_filter(filter: AbstractFilter, *arguments: jax.Array) -> PyTree:
 
 
 def _find_refused_meshes(network: Network) -> Iterator[tuple[str, str]]:
-    """Yield (name, reason) for each fusion between neighbours whose step is too long to write out as native code."""
+    """Yield (name, reason) for each fusion between neighbours whose step is too long to write out as native code.
+
+    XLA computes it then, which takes longer to begin.
+    """
     for name, fusion in network.meshes.items():
         nodes = len(network.mesh_nodes(name))
         # A rule that needs the joint covariance of all errors cannot be built for more than DENSE nodes.

@@ -13,7 +13,11 @@ Place = tuple[str, str]  # node and filter
 
 
 def find_remarking_filters(network: Network) -> tuple[Place, ...]:
-    """Return the places (node, name) of the filters that may remark on their state; FUSED is the centre's "node"."""
+    """Return the places (node, name) of the filters that may remark on their state; FUSED is the centre's "node".
+
+    A remark is what a filter has to say of its state after a run, such as how often its gate gave in. A filter of all
+    nodes' measurements stands at the centre.
+    """
     places = [(node, name) for node, name in network.estimate_indices if network.nodes[node].filters[name].remarks]
     for name, fusion in network.fused.items():
         if isinstance(fusion, AbstractFilter) and fusion.remarks:  # a filter of all nodes' measurements
@@ -23,6 +27,9 @@ def find_remarking_filters(network: Network) -> tuple[Place, ...]:
 
 def yield_remarks(network: Network, state: PyTree) -> Iterator[tuple[Place, Remark]]:
     """Yield each remark that a filter makes on its state, with the filter's place.
+
+    A stack has filters of one structure, at nodes of one structure (a group). A place is (node, name), with FUSED in
+    place of the node of a central filter, which receives all measurements.
 
     Args:
         network: the network.

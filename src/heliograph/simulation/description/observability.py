@@ -68,7 +68,11 @@ def _measure_from_states(
 def _measure_rows(
     plant: AbstractPlant, sensors: tuple[AbstractSensor, ...], x: jax.Array, rows: Int[Array, " steps"]
 ) -> jax.Array:
-    """Return y_1, ..., y_steps of all sensors from the state x in one row, one step for each entry of `rows`."""
+    """Return y_1, ..., y_steps of all sensors from the state x in one row, one step for each entry of `rows`.
+
+    There is no noise, and all inputs are 1. The result is flat: all outputs of the first step, then of the second, and
+    so on.
+    """
     u = jnp.ones(len(plant.inputs))
 
     def step(x: jax.Array, _: object) -> tuple[jax.Array, jax.Array]:

@@ -54,7 +54,9 @@ def _yield_models_with_calls(network: HasNodes) -> Iterator[tuple[str, object, l
 
 def _yield_arrays(model: object, functions: list[Traced]) -> Iterator[Any]:
     """Yield the arrays of a model, and those that its functions hold."""
-    yield from (x for x in jax.tree.leaves(model) if isinstance(x, jax.Array | np.ndarray) and not is_traced(x))
+    for leaf in jax.tree.leaves(model):
+        if isinstance(leaf, jax.Array | np.ndarray) and not is_traced(leaf):
+            yield leaf
     for function, arguments in functions:
         yield from _collect_arrays(function, *arguments)
 

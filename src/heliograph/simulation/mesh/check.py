@@ -113,11 +113,12 @@ def find_claim_of_mesh(name: str, fusion: Fusion, network: HasNodes) -> Claim:
     """
     claim_of_errors = find_claim_of_errors(name, fusion, network)
     nodes = [network.nodes[node] for node in network.mesh_nodes(name)]
-    senders = [node for node in nodes if isinstance(node, Node)]
-    is_disturbed = fusion.quantizer is not None or any(sender.disturbs_what_is_sent for sender in senders)
-    if is_disturbed or isinstance(fusion.rule, FrozenWeights):
+    is_disturbed = any(node.disturbs_what_is_sent for node in nodes if isinstance(node, Node))
+    if is_disturbed or fusion.quantizer is not None or isinstance(fusion.rule, FrozenWeights):
         return weakest([claim_of_errors, "nominal"])
-    return claim_of_errors if fusion.rule.needs_joint else weakest([claim_of_errors, "upper"])
+    if fusion.rule.needs_joint:  # it weighs by the joint covariance
+        return claim_of_errors
+    return weakest([claim_of_errors, "upper"])  # an intersection
 
 
 def _check_rule(what: str, fusion: Fusion, network: HasNodes) -> None:
@@ -306,7 +307,11 @@ def _scale_rows(h: np.ndarray) -> np.ndarray:
 
 
 def _get_gain_and_noise(node: Node) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean matrix H from the state to what a node receives, and the noise covariance R at a signal of 0."""
+    """Return the mean matrix H from the state to what a node receives, and the noise covariance R at a signal of 0.
+
+    The node receives z = G (C x + v) + n with a random gain G: H = E[G] C and R = E[G] Cov(v) E[G]' + Cov(n). The noise
+    that a random gain makes in proportion to the signal is left out.
+    """
     sensor, channel = first(node.sensor), second_order(first(node.channel).condition_on_arrival())
     assert isinstance(sensor, LinearSensor)  # as its filter's claim requires
     # `center` is the covariance of (gains, offset). At a signal of 0 only the offset's entry, the last, makes noise.

@@ -307,7 +307,7 @@ def compute_full_step(mesh: Mesh, covariance: np.ndarray, moments: PyTree, u: np
 
 
 def _extend_known_data(known: Any, mesh: Mesh, present: np.ndarray) -> Any:
-    """Return which nodes' data reach which node, with one more exchange put before those already counted.
+    """Return which nodes' data reach which node, with one more exchange between neighbours put before those counted.
 
     `known`: sparse (node, node), a one where data of the column's node reach the row's node. `present`: which messages
     arrive in the new exchange (node, degree).

@@ -123,6 +123,7 @@ def _list_patterns(mesh: Mesh, fusion: Fusion) -> tuple[ArrivalPatterns, Mesh]:
     A pattern says of each neighbour's message whether it arrives.
     """
     graph = graph_of(fusion.neighbours or {}, mesh.nodes)
+    # The probability that a message arrives, for each edge from neighbour to neighbour; without links all arrive.
     links = {} if fusion.link is None else links_by_edge(fusion.link, graph)
     chances = [_get_known_probability(name, link) for name, link in links.items()] or [1.0] * len(graph.edges)
     patterns = _compute_pattern_probabilities(mesh, np.array(chances))
@@ -148,6 +149,8 @@ def _compute_gains_by_pattern(
     rows: Mesh, covariance: np.ndarray, blocks: np.ndarray, patterns: ArrivalPatterns, step: MeshStep
 ) -> NodeGains:
     """Return the gains of a node for each pattern of arriving messages, with a leading axis of patterns.
+
+    A pattern says which of its neighbours' messages reach a node in the step.
 
     Args:
         rows: the mesh with a row for each pattern of each node, instead of one for each node.

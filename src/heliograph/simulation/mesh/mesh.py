@@ -319,7 +319,7 @@ class Mesh(Module):
         return jnp.tensordot(self.find_known_measurements(arrived).astype(values.dtype), values, 1)
 
     def find_known_measurements(self, arrived: Arrived) -> Bool[jax.Array, "node node"]:
-        """Return for each node (row) whether it has each node's (column) measurement after all rounds."""
+        """Return which nodes' measurements (column) each node (row) has after all rounds, by the messages `arrived`."""
         has_measurement, arrived = jnp.eye(len(self.senders), dtype=bool), jnp.asarray(arrived)
         # In each round a node gets all measurements that the senders of its arriving messages had before the round.
         for round_number in range(self.edges.rounds):

@@ -192,9 +192,9 @@ def propagate_joint(
         present: True for a neighbour (node, degree); all other places only pad the rows to one length.
     """
     gains, motion = step.gains, step.motion
-    # Blocks (node, degree, n, n) of M, of W (0 for measurements that did not arrive) and of W S.
-    m_blocks = error_transitions(gains, motion.matrix)
+    # Blocks (node, degree, n, n) of W (0 for measurements that did not arrive), of M and of W S.
     w_blocks = measurement_weights(gains.gain, jnp.asarray(arrived))
+    m_blocks = error_transitions(gains, motion.matrix)
     ws_blocks = w_blocks @ step.data.information[senders]
     # The same as matrices (N, N) of all nodes, N = nodes n.
     m, ws, w = (scatter_blocks(jnp.asarray(blocks), senders, present) for blocks in (m_blocks, ws_blocks, w_blocks))

@@ -147,8 +147,9 @@ def _warn_of_record(network: Network, record: Record, state: PyTree) -> None:
     `state`: states of all filters after the last row.
     """
     warn_of_non_finite_numbers(record)
-    doubts = *doubt_wide_angles_in_rows(network, record), *doubt_estimates(network, record)
-    _warn_of_each((*doubts, *_describe_left_out(network, record), *describe_remarks(network, state)))
+    lines = [*doubt_wide_angles_in_rows(network, record), *doubt_estimates(network, record)]
+    lines += [*_describe_left_out(network, record), *describe_remarks(network, state)]
+    _warn_of_each(lines)
 
 
 def _make_record(network: Network, smoothing: SmoothingPlan | None, outputs: PyTree, clock: np.ndarray) -> Record:

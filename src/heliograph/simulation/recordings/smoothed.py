@@ -108,17 +108,22 @@ def _turn_angles_to_truth(
     def wrap(estimate: Estimate, angles: Angles) -> Estimate:
         """Return an estimate (time, ..., n) with its angles within half a turn of those of the truth (time, n)."""
         mean = jnp.asarray(estimate.mean)
+        # Axes of length 1 in the places of the mean's axes between time and state, such as filters and nodes.
         truth_at_each = truth.reshape(len(truth), *[1] * (mean.ndim - 2), -1)
         return replace(estimate, mean=wrap_near(mean, truth_at_each, angles))
 
-    # All stacks that have angles have the plant's.
+    # The plant's angles are those of any stack that has some.
     of_plant = next((angles for angles in angles_of_stacks if angles), ())
     estimates = tuple(wrap(e, angles) for e, angles in zip(smoothed["estimates"], angles_of_stacks, strict=True))
     return {"estimates": estimates, "fused": {name: wrap(e, of_plant) for name, e in smoothed["fused"].items()}}
 
 
 def _fuse_at_each_time(fusion: StackedFusions, estimates: Sequence[Estimate]) -> dict[str, Estimate]:
-    """Return the fused estimates (time, ...) by name, from nodes' estimates (time, filter, node, ...) by stack."""
+    """Return the fused estimates (time, ...) by name, from nodes' estimates (time, filter, node, ...) by stack.
+
+    A stack has filters of one structure. The rule of fusion has no state: smoothed estimates of one time are fused as
+    filtered ones are, without quantizers.
+    """
 
     def fuse(estimates: Sequence[Estimate]) -> dict[str, Estimate]:
         """Return the fused estimates of one time, by name, from nodes' estimates (filter, node, ...) by stack."""

@@ -38,7 +38,10 @@ def choose_filters(
 
 
 def find_state_indices(states: Sequence[str] | None, known: Sequence[str]) -> list[int]:
-    """Return the indices of the chosen `states` in `known`, or of all if None; an unknown one is a ValueError."""
+    """Return the indices of the chosen `states` in `known`, or of all if None; an unknown one is a ValueError.
+
+    `states`: one name, or several.
+    """
     one_or_all = [states] if isinstance(states, str) else states
     chosen = list(known if one_or_all is None else one_or_all)
     for name in chosen:

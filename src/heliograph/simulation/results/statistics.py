@@ -54,7 +54,7 @@ class ErrorStatistics:
         return f"no valid {moment} from step {step} in {self.failed_runs} of {self.runs} runs"
 
     def _warn_of_failures(self) -> None:
-        """Warn, at the caller of a public method, that figures are NaN since some run had no valid estimate."""
+        """Warn, at the caller of a public method, that figures are NaN where some run had no valid estimate."""
         if self.failed_runs:
             warnings.warn(self.failure, stacklevel=3)
 
@@ -100,15 +100,22 @@ class ErrorStatistics:
         return _root_mean(squared, self.count)
 
     def rmse_by_state(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the root mean squared error of each state over runs and steps, and its standard error: (n,), (n,)."""
+        """Return the root mean squared error of each state over runs and steps, and its standard error: (n,), (n,).
+
+        The standard error comes from the scatter between batches of runs.
+        """
         self._warn_of_failures()
         # `outer`: e e' summed over the runs of each batch, (batch, time, n, n).
         squared = np.diagonal(self.outer, axis1=-2, axis2=-1).mean(axis=1)
-        roots_and_errors = [_root_mean(squared[:, i], self.count) for i in range(squared.shape[1])]
-        return np.array([root for root, _ in roots_and_errors]), np.array([error for _, error in roots_and_errors])
+        roots, errors = [], []
+        for squared_of_state in squared.T:
+            root, error = _root_mean(squared_of_state, self.count)
+            roots.append(root)
+            errors.append(error)
+        return np.array(roots), np.array(errors)
 
     def deviation_by_state(self) -> np.ndarray:
-        """Return the root of the mean over runs and steps of each state's claimed variance, (n,)."""
+        """Return the root of the mean, over runs and steps, of the variance claimed of each state, (n,)."""
         self._warn_of_failures()
         variance = np.diagonal(self.claimed(), axis1=-2, axis2=-1).mean(axis=0)
         return np.sqrt(np.where(variance >= 0, variance, np.nan))  # NaN of what is no variance

@@ -47,8 +47,10 @@ class NetworkStep(Module):
     def __init__(self, network: Network, filters: AllFilters):
         """Store the filters and, by group of nodes, the indices of each node's components in the joined measurement."""
         self.filters = filters
-        indices = {name: tuple(rows) for name, rows in network.rows.items()}
-        self.columns = tuple(tuple(indices[name] for name in names) for names in network.groups)
+        columns_by_group = []
+        for names in network.groups:
+            columns_by_group.append(tuple(tuple(network.rows[name]) for name in names))
+        self.columns = tuple(columns_by_group)
 
     def step(self, state: PyTree, received: jax.Array, u: jax.Array, k: jax.Array) -> tuple[PyTree, PyTree]:
         """Return all filters' states after step k, without implausible measurements, and the outputs.
@@ -261,7 +263,8 @@ class OneRowStep:
 def _check_reports(filters: AllFilters) -> None:
     """Raise ValueError if nodes report to a centre over random links.
 
-    A row says what a node measured, but not which report arrived.
+    A report is an estimate that a node sends to a centre. A row says what a node measured, but not which report
+    arrived: that could only be known of links without channels (`uplinks.groups` is empty).
     """
     for name, by_report in filters.reporting.items():
         if by_report.uplinks.groups:

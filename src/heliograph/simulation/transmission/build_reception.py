@@ -1,6 +1,6 @@
 """Transmission of a network, built: its nodes by structure, or the slots and hops of its relays."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from heliograph.simulation.transmission.slotted_relays import SlottedRelays, fin
 
 
 def make_reception(network: Network) -> AbstractMedium:
-    """Return the medium of a network: what transmits from the plant to its nodes."""
+    """Return the medium of a network: what transmits from the plant to its nodes, over sensors, channels and relays."""
     if network.relays is not None:
         return _make_slots(network, network.relays)
     if network.common is not None:
@@ -51,7 +51,10 @@ def make_reception(network: Network) -> AbstractMedium:
 
 
 def _make_slots(network: Network, relays: RelayNetwork) -> SlottedRelays:
-    """Return the medium of a network's relays, which send to each other in slots, one after another within a step."""
+    """Return the medium of a network's relays, which send to each other in slots, one after another within a step.
+
+    A slot says who sends to whom over which hop (link); slots take turns, step by step. The medium is what transmits.
+    """
     number_of_listener = {name: i for i, name in enumerate(relays.filters)}
     listeners_by_group = [tuple(number_of_listener[name] for name in names) for names in network.groups]
     hops = {name: hop.channel for name, hop in find_hops_with_memory(relays).items()}

@@ -157,9 +157,15 @@ def start_channel(channel: Channel, key: jax.Array, source: Number, shared: Memo
 
 
 def start_modes(models: PyTree, key: jax.Array, shared: MemoryNumbers) -> tuple[jax.Array, ...]:
-    """Return the states of the memories of a plant or sensor at the first step of the run with this key."""
-    numbered = zip(memories(models).values(), shared, strict=True)
-    return tuple(memory.begin(draw_key(key, k=0, source=number, purpose=MEMORY_START)) for memory, number in numbered)
+    """Return the states (modes) of the memories of a plant or sensor at the first step of the run with this key.
+
+    A memory is a state that is random over time, such as a Markov chain of modes. `shared`: the numbers that seed their
+    draws; memories of one number begin alike.
+    """
+    states = []
+    for memory, number in zip(memories(models).values(), shared, strict=True):
+        states.append(memory.begin(draw_key(key, k=0, source=number, purpose=MEMORY_START)))
+    return tuple(states)
 
 
 def move_modes(
@@ -169,8 +175,10 @@ def move_modes(
 
     `shared`: the numbers that seed their draws. Memories with one number move alike.
     """
-    states_and_seeds = zip(memories(models).values(), states, shared, strict=True)
-    return tuple(memory.move(state, draw_key(key, k, number, MEMORY)) for memory, state, number in states_and_seeds)
+    after = []
+    for memory, state, number in zip(memories(models).values(), states, shared, strict=True):
+        after.append(memory.move(state, draw_key(key, k, number, MEMORY)))
+    return tuple(after)
 
 
 def deliver_signal(
