@@ -18,7 +18,10 @@ Precision = TypeAliasType("Precision", Literal["float64", "float32"])  # of the 
 
 
 def make_run_key(key: object) -> jax.Array:
-    """Return the JAX random key of a run from a seed, or the key itself; raise ValueError for anything else."""
+    """Return the JAX random key of a run from a seed, or the key itself; raise ValueError for anything else.
+
+    A seed is a whole number; draws of a run are made from its key, the step and names alone.
+    """
     if isinstance(key, jax.Array) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key) and key.shape == ():
         return key
     if isinstance(key, jax.Array | np.ndarray):
@@ -27,7 +30,12 @@ def make_run_key(key: object) -> jax.Array:
 
 
 def read_plant_inputs(network: Network, inputs: ArrayLike | None, horizon: int) -> np.ndarray:
-    """Return the plant's inputs, checked, as an array (horizon, inputs); None will do for a plant without inputs."""
+    """Return the plant's inputs, checked, as an array (horizon, inputs); None will do for a plant without inputs.
+
+    Row k is what acts on the plant in the step that leads to measurement k. Columns of a table with names must have the
+    names of the inputs, in their order; values must be allowed by plant, nodes and fusions, such as a time step above
+    0.
+    """
     count = len(network.inputs)
     if inputs is None and count:
         raise fail("inputs", f"an array ({horizon}, {count}) of {list(network.inputs)}", "none")
@@ -51,6 +59,7 @@ def read_measurements(name: str, value: ArrayLike, steps: int, node: Node | Rece
     """
     title, received = f"measurements of node {name!r}", node.received
     check_columns(title, value, node.received_names)
-    is_one_axis = received == 1 and rank(title, value) == 1
-    values: np.ndarray = array(title, value, (steps,) if is_one_axis else (steps, received), missing=True)
-    return values[:, None] if is_one_axis else values
+    has_one_axis = received == 1 and rank(title, value) == 1
+    shape = (steps,) if has_one_axis else (steps, received)
+    values: np.ndarray = array(title, value, shape, missing=True)  # checked to have this shape, NaN allowed
+    return values.reshape(steps, received)

@@ -112,35 +112,50 @@ def _judge_links(network: Network, a: np.ndarray, q: np.ndarray, links: JointLin
     long ("impossible"). Else the verdict is "undecided". `a` and `q` are A and Q; `links`: joint model of all links'
     losses.
     """
-    # First sums whose gain is known on all of x. If these certify nothing, use sums whose gain is known only on the
-    # modes of A that do not decay: there are more of them.
+    # First sums whose gain is known on all of x. If these certify nothing, those whose gain is known on the modes of A
+    # that do not decay: there are more of them.
     unstable_modes = _find_unstable_modes(a)
-    for basis in (np.eye(len(a)), unstable_modes):
-        usable = _find_usable_measurements(a, q, links, basis)
-        gains = find_gains(usable.system)
-        radius = certify_radius(usable.system, gains)
-        if radius < BELOW_ONE:
-            # The steady covariance with these gains bounds the mean error covariance E P in the long run.
-            bound = usable.system.solve_steady_covariances(gains).sum(axis=0) if usable.exact else None
-            return Boundedness(
-                verdict="certified",
-                reason=_describe_certificate(a, radius),
-                radius=radius,
-                growth=0.0,
-                gains=usable.map_gains(gains),
-                bound=bound,
-            )
-    # Not certified. By what is usable on the modes that do not decay: do losses hide one of them?
+    usable, gains, radius = _find_best_gains(a, q, links, basis=np.eye(len(a)))
+    if not radius < BELOW_ONE:
+        usable, gains, radius = _find_best_gains(a, q, links, basis=unstable_modes)
     system = usable.system
-    unseen = find_fastest_unobserved_mode(a, system.chain, [system.outputs[state] for state in system.known])
+    if radius < BELOW_ONE:
+        # The sum over i of U_i, the steady error covariance in state i of the losses, bounds E P in the long run.
+        bound = system.solve_steady_covariances(gains).sum(axis=0) if usable.exact else None
+        return Boundedness(
+            verdict="certified",
+            reason=_describe_certificate(a, radius),
+            radius=radius,
+            growth=0.0,
+            gains=usable.map_gains(gains),
+            bound=bound,
+        )
+    # Not certified. Do losses hide a mode that does not decay? By state of the losses: the usable sums' gain on x.
+    outputs_by_state = [system.outputs[kind] for kind in system.known]
+    unseen = find_fastest_unobserved_mode(a, system.chain, outputs_by_state)
     verdict, reason = _judge_unobserved_modes(network, links, unstable_modes, usable, unseen, radius)
     return Boundedness(
         verdict=verdict, reason=reason, radius=radius, growth=unseen.growth, gains=usable.map_gains(gains), bound=None
     )
 
 
+class _FixedGains(NamedTuple):
+    """Fixed filter gains on sums of received numbers, and the spectral radius of E[e e'] -> E[e+ e+'] under them."""
+
+    usable: "UsableMeasurements"
+    gains: KindGains
+    radius: float
+
+
+def _find_best_gains(a: np.ndarray, q: np.ndarray, links: JointLinks, basis: Float[np.ndarray, "n d"]) -> _FixedGains:
+    """Return the best fixed gains that a search finds on sums whose gain is known on the span of the basis."""
+    usable = _find_usable_measurements(a, q, links, basis)
+    gains = find_gains(usable.system)
+    return _FixedGains(usable, gains, radius=certify_radius(usable.system, gains))
+
+
 def _find_unstable_modes(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n d"]:
-    """Return an orthonormal basis, one column each, of the plant's modes that do not decay."""
+    """Return an orthonormal basis, one column each, of the modes of A = `matrix` that do not decay: |lambda| >= 1."""
     _, basis, count = scipy.linalg.schur(matrix / BELOW_ONE, sort="ouc")  # first those outside the unit circle
     return np.asarray(basis[:, :count])
 
@@ -149,8 +164,8 @@ class UsableMeasurements(NamedTuple):
     """What a receiver can use of its measurements: sums of known gain, by the kind of losses that it sees.
 
     Args:
-        system: the plant, measured by sums of what arrives.
-        kinds: flags of the components that arrive.
+        system: the plant x+ = A x + w, measured by sums of what arrives, with the Markov chain of the losses.
+        kinds: for each kind of losses, a flag for each received component: whether it arrives.
         known_sums: the sums D z of received numbers z that are used in each kind.
     """
 
@@ -191,7 +206,7 @@ def _find_usable_measurements(
     """
     # All outcomes of all modes one after another, the mode of each, and its pattern of what arrives.
     outcomes = [outcome for outcomes_of_mode in links.outcomes for outcome in outcomes_of_mode]
-    mode = np.array([i for i, outcomes_of_mode in enumerate(links.outcomes) for _ in outcomes_of_mode])
+    mode = np.repeat(np.arange(len(links.outcomes)), [len(outcomes_of_mode) for outcomes_of_mode in links.outcomes])
     patterns = [tuple(outcome.arrived.tolist()) for outcome in outcomes]
     # Kinds of losses, which kind each outcome is, and the sums of known gain in each kind.
     kinds = list(dict.fromkeys(patterns))
@@ -338,13 +353,15 @@ def _explain_unbounded_error(links: JointLinks, system: KnownLossSystem, unseen:
     mode = f"the plant's mode of eigenvalue {value.real:.6g}" + (f" +- {value.imag:.6g}i" if value.imag else "")
     if len(unseen.modes) < len(system.chain):
         return f"{mode} grows by {unseen.growth:.6g} >= 1 a step in mean square while what would show it is lost"
-    # E[G' G] of each outcome, without offsets: is there any gain on the mode, if none that is known?
+    # No known gain shows the mode's eigenvectors V. Does a random one, G of z = G (H x + v) + n? It does if the mean
+    # power E |G H V|^2 = tr((H V)* E[G' G] H V) is positive in some outcome of the losses.
+    seen = links.sensing @ unseen.vectors  # H V
     powers = []
-    for outcome in (outcome for of_mode in links.outcomes for outcome in of_mode):
-        _, second = second_moments(outcome.map)
-        powers.append(np.einsum("iiab->ab", second)[:-1, :-1])
-    seen = links.sensing @ unseen.vectors
-    if max(float(np.real(np.einsum("ad,ab,bd->", seen.conj(), power, seen))) for power in powers) > 0:
+    for outcome in (outcome for outcomes_of_mode in links.outcomes for outcome in outcomes_of_mode):
+        _, second = second_moments(outcome.map)  # E[G_ia G_jb] as [i, j, a, b]; the last column of G is its offset
+        gain_power = np.einsum("iiab->ab", second)[:-1, :-1]  # E[G' G], without the offset
+        powers.append(float(np.real(np.einsum("ad,ab,bd->", seen.conj(), gain_power, seen))))
+    if max(powers) > 0:
         return f"{mode} is seen only through random gains that are not known, which make noise as large as the state"
     return f"{mode} is not seen at all"
 

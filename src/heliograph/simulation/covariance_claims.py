@@ -55,8 +55,8 @@ class MistakenBelief(NamedTuple):
     def words(self) -> str:
         """Return the mistake as a sentence such as "filter 'f' believes another channel than node 'a'".
 
-        FUSED is the name under which central filters stand. RANGE in `self.parts` says that limits refuse some
-        readings. UNSAID says that the filter does not tell for which models it was made.
+        `self.node` is FUSED for a filter of all nodes' measurements. RANGE in `self.parts` says that limits refuse some
+        readings, UNSAID that the filter does not tell for which models it was made.
         """
         place = "all nodes together" if self.node == FUSED else f"node {self.node!r}"
         reason = ", where limits refuse some" if RANGE in self.parts else ""
@@ -103,7 +103,10 @@ def lower_claim_if_mistaken(own_models: AssumedModel, filter: AbstractFilter) ->
 
 
 def lower_claims_of_nodes(network: HasNodes) -> dict[str, Node | ReceivingNode]:
-    """Return the nodes, each filter's claim lowered to "nominal" if it was made for other models than the node's."""
+    """Return the nodes with claims that hold there: a filter made for other models than its node's claims "nominal".
+
+    A filter's claim is what its covariance is said to be: exact, an upper bound, or nominal (right if its models are).
+    """
     nodes = dict(network.nodes)
     for name, node in network.nodes.items():
         if node.filters:
@@ -116,7 +119,8 @@ def lower_claims_of_nodes(network: HasNodes) -> dict[str, Node | ReceivingNode]:
 def pad_filters_alike(nodes: Mapping[str, Node | ReceivingNode]) -> dict[str, Node | ReceivingNode]:
     """Return the nodes with filters whose arrays are padded to the largest of all filters, so that they can be stacked.
 
-    Only filters that know a sender's heartbeat differ in length; all are padded to the longest heartbeat.
+    Only filters that know a sender's heartbeat, the most steps between two messages, differ in the length of their
+    arrays: all are padded to the longest heartbeat.
     """
     all_filters = [filter for node in nodes.values() for filter in node.filters.values()]
     padded: dict[str, Node | ReceivingNode] = {}
@@ -135,12 +139,11 @@ def lower_claims_of_central_filters(network: HasNodes) -> dict[str, Fusion | Abs
     if not any(isinstance(fusion, AbstractFilter) for fusion in network.fused.values()):
         return network.fused
     own_models = find_common_assumed(network)
-    return {
-        name: lower_claim_if_mistaken(own_models, filter_or_fusion)
-        if isinstance(filter_or_fusion, AbstractFilter)
-        else filter_or_fusion
-        for name, filter_or_fusion in network.fused.items()
-    }
+    fused = dict(network.fused)
+    for name, fusion in network.fused.items():
+        if isinstance(fusion, AbstractFilter):
+            fused[name] = lower_claim_if_mistaken(own_models, fusion)
+    return fused
 
 
 def make_nodes_nominal(network: HasNodes) -> dict[str, Node | ReceivingNode]:
@@ -152,8 +155,15 @@ def make_nodes_nominal(network: HasNodes) -> dict[str, Node | ReceivingNode]:
 
 
 def make_fusions_nominal(network: HasNodes) -> dict[str, Fusion | AbstractFilter]:
-    """Return the fusions, with filters that claim "nominal" at most."""
-    return {name: lower_to_nominal(f) if isinstance(f, AbstractFilter) else f for name, f in network.fused.items()}
+    """Return the fusions by name; those that are filters of all measurements claim "nominal" at most.
+
+    Fusions of the nodes' estimates are unchanged: what they claim follows from the nodes' claims.
+    """
+    fused = dict(network.fused)
+    for name, fusion in network.fused.items():
+        if isinstance(fusion, AbstractFilter):
+            fused[name] = lower_to_nominal(fusion)
+    return fused
 
 
 def _replace_filters(node: Node | ReceivingNode, filters: dict[str, AbstractFilter]) -> Node | ReceivingNode:
@@ -210,12 +220,17 @@ def find_common_assumed(network: HasNodes) -> AssumedModel:
     """
     if network.common is not None:
         return AssumedModel(network.plant, network.common.sensor, network.common.channel)
-    nodes = [name for name in network.names if isinstance(network.nodes[name], Node)]
-    return join_assumed([find_assumed(network, name) for name in nodes]) if nodes else AssumedModel(network.plant)
+    models = [find_assumed(network, name) for name in network.names if isinstance(network.nodes[name], Node)]
+    if not models:  # no node has a sensor
+        return AssumedModel(network.plant)
+    return join_assumed(models)
 
 
 def yield_mistaken_beliefs(network: HasNodes) -> Iterator[MistakenBelief]:
-    """Yield the filters made for other models than those of the place where they stand; central filters come last."""
+    """Yield the filters made for other models than those of the place where they stand; central ones come last.
+
+    A central filter receives the measurements of all nodes: its models have to be those of all nodes together.
+    """
     for name in network.names:
         if filters := network.nodes[name].filters:
             yield from _yield_mistaken_beliefs(name, find_assumed(network, name), filters)
@@ -273,8 +288,9 @@ def find_claims(network: HasNodes) -> dict[tuple[str, str], Claim]:
 def _find_claim_of_fusion(network: HasNodes, fusion: Fusion | AbstractFilter) -> Claim:
     """Return what a fusion can claim of its covariance, from its rule, its nodes' claims and how they report.
 
-    A claim is what the covariance is said to be: exact, an upper bound, or nominal. A report is the estimate that a
-    node sends to the centre; with `by_report` the centre models the report's way, its uplink or its quantizer.
+    A claim is what the covariance is said to be: exact, an upper bound, or nominal. An informed rule is one that needs
+    the joint covariance of the nodes' errors. A report is the estimate that a node sends to the centre; with
+    `by_report` the centre models the report's way, its uplink or its quantizer.
 
     Args:
         network: the network, whose nodes have filters and claims.

@@ -56,12 +56,17 @@ def check_filter_flags(name: str, filter: AbstractFilter, channels: Sequence[Abs
 def _find_flag_filters(filter: AbstractFilter) -> list[SideInformationFilter | ModeObservedFilter]:
     """Return the filters that use flags, also those inside other filters.
 
-    A flag is a number after the measurement that tells the mode of a link.
+    A flag is a number after the measurement that tells the mode of a link. `ModeObservedFilter` always uses flags,
+    `SideInformationFilter` only where it is `flagged`: else it uses other side information, without flags.
     """
     kinds = SideInformationFilter, ModeObservedFilter
+    # The filter as a tree, whose leaves are filters of these kinds, or arrays.
     leaves = jax.tree.leaves(filter, is_leaf=lambda leaf: isinstance(leaf, kinds))
-    filters = [leaf for leaf in leaves if isinstance(leaf, kinds)]
-    return [filter for filter in filters if isinstance(filter, ModeObservedFilter) or filter.flagged]
+    found: list[SideInformationFilter | ModeObservedFilter] = []
+    for leaf in leaves:
+        if isinstance(leaf, ModeObservedFilter) or (isinstance(leaf, SideInformationFilter) and leaf.flagged):
+            found.append(leaf)
+    return found
 
 
 def _reveals_mode(affine: AbstractRandomAffine, late: bool) -> bool:

@@ -69,6 +69,9 @@ def _sum_log_likelihoods(
 
 
 def _judge_likelihood(filter: AbstractFilter, state: PyTree, innovation: Innovation, k: Array) -> jax.Array:
-    """Return the log-likelihood of a row; NaN where the estimate is no number, since the row would look lost."""
+    """Return the log-likelihood of a row's innovation; NaN where the estimate is no number.
+
+    Without the NaN such a row would add 0, as one in which nothing arrived.
+    """
     lost = jnp.any(jnp.isnan(jnp.asarray(filter.estimate(state).mean)))
     return jnp.where(lost, jnp.nan, innovation.log_likelihood)

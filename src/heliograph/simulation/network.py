@@ -138,7 +138,7 @@ class Network(Module):
         self.rows = FrozenMapping(find_rows_of_nodes({name: node.received for name, node in self.nodes.items()}))
         # A filter made for other models than its node's claims less. Arrays get one length, so that they stack.
         self.nodes = pad_filters_alike(lower_claims_of_nodes(self))
-        # Groups of nodes and stacks of filters, by structure.
+        # Groups of nodes and stacks of filters, by structure. `meshes`: each node's fusions between neighbours.
         meshes = {name: tuple(m for m in self.meshes if name in self.mesh_nodes(m)) for name in self.names}
         self.groups = group_by_structure(
             (name, without_output_names((get_parts_of_reception(n), n.filters, meshes[name])))
@@ -159,9 +159,8 @@ class Network(Module):
         """Raise ValueError unless nodes and filters fit the plant, and names' checksums, which seed draws, differ."""
         node_type = Node if self.relays is None and self.common is None else ReceivingNode
         for name, node in self.nodes.items():
-            if (
-                not isinstance(node, ReceivingNode) or node.filters
-            ):  # a ReceivingNode without filters may stand anywhere
+            may_stand_anywhere = isinstance(node, ReceivingNode) and not node.filters
+            if not may_stand_anywhere:
                 check_type(f"node {name!r}", node, node_type)
             for label, filter in node.filters.items():
                 check_states(f"filter {label!r} of node {name!r}", filter, self)
@@ -321,14 +320,14 @@ class Network(Module):
     @cached_property
     def angles(self) -> dict[str, Angles]:
         """Indices of the angles among the numbers that each node receives, by node."""
-        if self.common is None:
-            return {
-                name: find_received_angles(self.plant, node.sensor, node.channel) if isinstance(node, Node) else ()
-                for name, node in self.nodes.items()
-            }
-        # Of one channel for all, each node receives some rows.
-        angles = find_received_angles(self.plant, self.common.sensor, self.common.channel)
-        return {name: tuple(i - rows.start for i in angles if i in rows) for name, rows in self.rows.items()}
+        if self.common is not None:  # each node receives some rows of one channel
+            angles = find_received_angles(self.plant, self.common.sensor, self.common.channel)
+            return {name: tuple(i - rows.start for i in angles if i in rows) for name, rows in self.rows.items()}
+        angles_by_node: dict[str, Angles] = dict.fromkeys(self.nodes, ())
+        for name, node in self.nodes.items():
+            if isinstance(node, Node):
+                angles_by_node[name] = find_received_angles(self.plant, node.sensor, node.channel)
+        return angles_by_node
 
     def diagram(self) -> str:
         """Return all of the network as lines of text, of which `repr` shows the first."""
@@ -359,15 +358,16 @@ class Network(Module):
 
         Sensor and channel are the node's own, or common to all nodes. A node behind relays has neither and is left out.
         """
-        nodes = {label: self.nodes[label] for label in self.nodes_with(name)}
-        # The owner of each node's sensor and channel: the node, or what all nodes share, or None behind relays.
-        owners = {label: node if isinstance(node, Node) else self.common for label, node in nodes.items()}
-        return {
-            label: (owner.sensor, owner.channel, nodes[label].filters[name]) for label, owner in owners.items() if owner
-        }
+        parts = {}
+        for label in self.nodes_with(name):
+            node = self.nodes[label]
+            owner = node if isinstance(node, Node) else self.common  # of sensor and channel; None behind relays
+            if owner is not None:
+                parts[label] = owner.sensor, owner.channel, node.filters[name]
+        return parts
 
     def check_horizon(self, horizon: int) -> None:
-        """Raise ValueError if something that varies over time ends before `horizon` steps."""
+        """Raise ValueError if a plant, sensor, channel or filter that varies over time ends before `horizon` steps."""
         one_of_each = [self.nodes[names[0]] for names in self.groups]  # a group's nodes cover the same steps
         check_horizon(horizon, steps_covered((self.plant, one_of_each, self.common, self.relays, self.fused)))
 

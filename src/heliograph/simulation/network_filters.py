@@ -94,12 +94,14 @@ class AllFilters(Module):
         self.smooths, self.judges = smoothed_stacks is not None, judges
         self.stacks = stack_filters(network, smoothed_stacks or (), judges)
         # At the centre: filters of all measurements; fusions by rules that need nothing but the estimates; fusions that
-        # need the joint covariance of the nodes' errors; fusions of reports over uplinks; fusions between neighbours.
+        # need the joint covariance of the nodes' errors.
         self.central = {name: fusion for name, fusion in network.fused.items() if isinstance(fusion, AbstractFilter)}
         self.fusions, self.centres = list_stacked_fusions(network), list_centres(network)
-        self.reporting, self.meshes = build_report_fusions(network, AllFilters), build_meshes(network)
+        # Fusions of reports over uplinks: each centre steps the nodes' filters itself, without data, for the moments of
+        # their errors, and makes these filters by this class. Then fusions between neighbours.
+        self.reporting = build_report_fusions(network, AllFilters)
+        self.meshes = build_meshes(network)
         self.tests = make_fused_innovations(network, self.stacks) if tests else {}
-        # `order` brings the groups' measurements into the nodes' order; `complete`: nothing of a group is ever missing.
         self.order = find_measurement_order(network.groups, network.rows)
         self.complete = tuple(network.nodes[names[0]].complete for names in network.groups)
         self.n = len(network.states)
@@ -107,9 +109,9 @@ class AllFilters(Module):
     def init(self) -> PyTree:
         """Return the states before the first step, as a tuple of six entries.
 
-        They are the states of: the nodes' filters, by stack; central filters, by
-        name; quantizers of the nodes' estimates, by stack of fusions; centres that propagate the joint covariance of
-        the nodes' errors; fusions of reports and between neighbours, by name; and fused estimates that are tested.
+        They are the states of: the nodes' filters, by stack; filters of all measurements, by name; quantizers of the
+        nodes' estimates, by stack of fusions; centres that propagate the joint covariance of the nodes' errors; fusions
+        of reports and between neighbours, by name; and fused estimates that are tested.
         """
         central = {name: initial_state(filter) for name, filter in self.central.items()}
         states = tuple(stacked.init() for stacked in self.stacks)
@@ -125,8 +127,7 @@ class AllFilters(Module):
     ) -> CentreState | dict[str, LinearisedFusionState]:
         """Return a centre's state before the first step, from the initial means of the filters that it fuses.
 
-        `states`: states of the nodes' filters by stack. `centre.sources`: (stack,
-        number within the stack) of each filter that it fuses.
+        `states`: of the nodes' filters by stack. `centre.sources`: (stack, number within the stack) of what it fuses.
         """
         means = []
         for stack, number in centre.sources:
@@ -138,8 +139,8 @@ class AllFilters(Module):
     @property
     def are_linear_and_unfused(self) -> bool:
         """Whether all filters are linear with gains that depend on no data, and none of their estimates is fused."""
+        are_fused = bool(self.fusions or self.centres or self.reporting or self.meshes)
         filters = [*(stacked.filters for stacked in self.stacks), *self.central.values()]
-        are_fused = self.fusions or self.centres or self.reporting or self.meshes
         return not are_fused and all(filter.is_linear for filter in filters)
 
     @property
@@ -154,13 +155,13 @@ class AllFilters(Module):
         the measurements are set to zero.
         """
         matrices = []
-        for stack, filter in centre.sources:
+        for stack, number in centre.sources:  # number of the filter within the stack
             stacked, zeros = self.stacks[stack], self._make_zeros(stack)
-            matrices.append(stacked.compute_by_node(centre.compute_matrices, states[stack], filter, zeros, u, k))
+            matrices.append(stacked.compute_by_node(centre.compute_matrices, states[stack], number, zeros, u, k))
         return matrices
 
     def step_without_data(self, states: PyTree, u: jax.Array, k: jax.Array) -> PyTree:
-        """Return the states of the nodes' filters by stack after step k with measurements of zero, for their gains."""
+        """Return the filters' states, by stack, after step k with measurements of zero, for their gains."""
         numbered = enumerate(zip(self.stacks, states, strict=True))
         return tuple(stacked.step(state, self._make_zeros(stack), u, k)[0] for stack, (stacked, state) in numbered)
 
@@ -258,9 +259,9 @@ class AllFilters(Module):
 
         An entry is (field of `StepOutput`, name of the output for the nodes' filters, name for central filters).
         """
+        for_smoothing = [("steps", "smoother_steps", "central_steps")]
         judgements = [("judgement", "judged", "judged_centrally"), ("weighed", "weighed", "weighed_centrally")]
-        steps = [("steps", "smoother_steps", "central_steps")]
-        return (steps if self.smooths else []) + (judgements if self.judges else [])
+        return (for_smoothing if self.smooths else []) + (judgements if self.judges else [])
 
     def _step_fusions(
         self,

@@ -40,7 +40,11 @@ def find_estimate_indices(
 
 
 def group_by_structure(items: Iterable[tuple[str, object]]) -> tuple[tuple[str, ...], ...]:
-    """Return the names in groups, in order of first appearance; models of one group differ only in their numbers."""
+    """Return the names of models of one structure together, in order of first appearance.
+
+    Models of one structure differ in the numbers of their arrays alone, so that arrays stack and one program serves
+    all.
+    """
     names_by_structure: dict[object, list[str]] = {}
     for name, model in items:
         names_by_structure.setdefault(structure_key(model), []).append(name)
@@ -65,10 +69,13 @@ def list_mesh_stacks(groups: Sequence[Sequence[str]], meshes: Mapping[str, Seque
 
     The fusions are sorted by name, as in compiled code. `meshes`: names of the fusions of each node.
     """
-    all_meshes = sorted({mesh for of_node in meshes.values() for mesh in of_node})
-    return tuple(
-        StackIndex(g, (mesh,)) for mesh in all_meshes for g, names in enumerate(groups) if mesh in meshes[names[0]]
-    )
+    all_meshes = sorted({mesh for meshes_of_node in meshes.values() for mesh in meshes_of_node})
+    stacks = []
+    for mesh in all_meshes:
+        for group, names in enumerate(groups):
+            if mesh in meshes[names[0]]:  # all nodes of a group take part in the same fusions
+                stacks.append(StackIndex(group, filters=(mesh,)))
+    return tuple(stacks)
 
 
 def find_rows_of_nodes(received: Mapping[str, int]) -> dict[str, range]:
@@ -80,9 +87,15 @@ def find_rows_of_nodes(received: Mapping[str, int]) -> dict[str, range]:
 def find_measurement_order(groups: Iterable[Sequence[str]], rows: Mapping[str, range]) -> np.ndarray | None:
     """Return the order that brings measurements joined group after group into the order of the nodes.
 
-    `rows`: where each node's measurements stand in the order of the nodes. The result is None if both orders are the
-    same, so that no gather is compiled.
+    If z_by_group has the measurements of the first group's nodes, then of the second group's, and so on, then
+    z_by_group[order] has those of the first node, of the second node, and so on. The result is None if both orders are
+    the same, so that no gather is compiled.
+
+    Args:
+        groups: names of the nodes of each group.
+        rows: where each node's measurements stand in the order of the nodes.
     """
-    position_by_group = np.concatenate([rows[name] for names in groups for name in names])  # in the nodes' order
-    order = np.argsort(position_by_group)
+    # For each measurement, group after group, its place in the order of the nodes; `argsort` inverts this.
+    place_in_node_order = np.concatenate([rows[name] for names in groups for name in names])
+    order = np.argsort(place_in_node_order)
     return None if np.array_equal(order, np.arange(len(order))) else order

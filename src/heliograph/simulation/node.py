@@ -170,7 +170,7 @@ class Node(Module):
         output that the channel carries, but not for a flag, which tells the channel's mode.
         """
         channel = first(self.channel)
-        if self.encoder is None or not self.encoder.subtracts:
+        if self.encoder is None or not self.encoder.subtracts:  # no dithers arrive
             side_information = self.received - channel.outputs
             return name_received_values(self.outputs, channel, side_information)
         carried_outputs = [output for output in find_carried_components(channel) if output != FLAG]
@@ -317,27 +317,36 @@ def check_states(name: str, filter: object, network: HasNodes) -> None:
                     f"the plant's {len(of_plant_names)} {kind} {list(of_plant_names)}",
                     f"{len(of_filter_names)} {list(of_filter_names)}",
                 )
-    # Numbers of the states that are attitudes, for the plant and for the filter.
+    # Indices of the states that are attitudes, of the plant and of the filter.
     of_plant, of_filter = plant.manifold.rotations, getattr(filter, "attitude", ())
     if of_plant != of_filter:
-        expected, got = ([network.states[i] for i in places] for places in (of_plant, of_filter))
+        expected, got = [network.states[i] for i in of_plant], [network.states[i] for i in of_filter]
         raise fail(name, f"a filter of all that is received, whose attitudes are the plant's, {expected}", got)
 
 
 def check_angles(name: str, filter: AbstractFilter, network: HasNodes) -> None:
-    """Raise ValueError unless a filter of all measurements takes as angles what are angles, and nothing else."""
+    """Raise ValueError unless a filter of all measurements takes as angles what are angles, and nothing else.
+
+    An error of an angle is wrapped to -pi ... pi, so a filter that took another number for an angle would be wrong.
+
+    Args:
+        name: name of the filter, for errors.
+        filter: the filter, which receives the measurements of all nodes, or none.
+        network: the network, whose plant and sensors say which states and received numbers are angles.
+    """
     used, angles = filter.angles_used(), first(network.plant).angles
     if used is None:  # a filter of a user's own class, which does not say
         return
     if used.states != angles:
-        expected, got = ([network.states[i] for i in places] for places in (angles, used.states))
+        expected, got = [network.states[i] for i in angles], [network.states[i] for i in used.states]
         raise fail(name, f"a filter whose angles are the plant's, {expected}", got)
     if not filter.received:
         return
-    # Angles among all that arrives, in the order of the nodes.
+    # A filter of all measurements receives z = (z_1, z_2, ...), node after node: names of its components, and the
+    # indices of those that are angles.
     names = [f"{node}.{part}" for node in network.names for part in network.nodes[node].received_names]
-    angles = [network.rows[node][i] for node in network.names for i in network.angles[node]]
-    expected, got = ([names[i] for i in places] for places in (angles, used.received))
+    received_angles = [network.rows[node][i] for node in network.names for i in network.angles[node]]
+    expected, got = [names[i] for i in received_angles], [names[i] for i in used.received]
     if expected != got:
         raise fail(name, f"a filter that receives the nodes' angles, {expected}", got)
 
@@ -353,7 +362,8 @@ def check_filters(filters: Mapping[str, object], received: int) -> None:
 def get_parts_of_reception(node: Node | ReceivingNode) -> object:
     """Return the parts of a node that determine its measurements.
 
-    Nodes whose parts have one structure and differ only in numbers are simulated as a group.
+    Nodes whose parts have one structure and differ only in numbers are simulated as a group. Filters count only where
+    the sender needs their predictions: as feedback (`informed_by`), or to decide when to send (`predictor`).
     """
     if isinstance(node, Node):
         carried = None if node.encoder is None else find_carried_components(node.channel)

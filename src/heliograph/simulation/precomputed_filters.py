@@ -23,13 +23,14 @@ def precompute_filters(filters: AllFilters, u: Float[Array, "horizon inputs"]) -
     group, and `filters.complete` says of each group whether that is so. Central filters need it of all groups, since
     they receive the measurements of all nodes.
     """
-    # The nodes' filters, of one structure in each stack; then the central filters.
+    # The nodes' filters, of one structure in each stack; then the central filters, by name.
     stacks = [_precompute_stack(stack, u) if filters.complete[stack.group] else stack for stack in filters.stacks]
     central_filters = filters.central if all(filters.complete) else {}
     precomputed = {
         name: compute_once(_precompute_filter, _precompute_by_xla, (filter, u, filters.smooths))
         for name, filter in central_filters.items()
     }
+    # A copy of all filters with these two fields replaced.
     changed = eqx.tree_at(lambda f: (f.stacks, f.central), filters, (tuple(stacks), filters.central | precomputed))
     return cast(AllFilters, to_numpy(changed))
 
@@ -68,8 +69,9 @@ def _precompute_all_by_xla(filters: AbstractFilter, u: Array, smooths: bool, cou
 def can_precompute(filters: AllFilters) -> bool:
     """Return whether some filter has anything to precompute.
 
-    `AbstractFilter.planned` returns the filter itself; a class with gains that depend on no data overrides it, to
-    return the filter with these gains computed.
+    Looked at are the stacked filters of the nodes, and those of all measurements. `AbstractFilter.planned` returns the
+    filter itself; a class with gains that depend on no data overrides it, to return the filter with these gains
+    computed.
     """
     all_filters = [*(stacked.filters for stacked in filters.stacks), *filters.central.values()]
     return any(type(filter).planned is not AbstractFilter.planned for filter in all_filters)

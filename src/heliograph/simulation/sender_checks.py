@@ -123,12 +123,13 @@ def count_subtracted_dithers(encoder: Words, channel: Channel) -> int:
 
 
 def flips_words(channel: AbstractRandomAffine) -> bool:
-    """Return whether a channel of words may flip bits."""
-    links = [link for link in [channel, *all_inner_maps(channel)] if isinstance(link, Flips)]
-    return any(float(link.error.moment(1)) > 0 for link in links)
+    """Return whether a channel of words may flip bits: whether a part of it has a mean rate of bit errors above 0."""
+    flipping_links = [link for link in [channel, *all_inner_maps(channel)] if isinstance(link, Flips)]
+    return any(float(link.error.moment(1)) > 0 for link in flipping_links)
 
 
 def check_type(name: str, value: object, expected: type) -> None:
     """Raise ValueError for an object of another class than `expected`; `name`: what it is, for the error."""
     if not isinstance(value, expected):
-        raise fail(name, f"{'an' if expected.__name__[0] in 'AEIOU' else 'a'} {expected.__name__}", show_value(value))
+        article = "an" if expected.__name__[0] in "AEIOU" else "a"
+        raise fail(name, f"{article} {expected.__name__}", show_value(value))

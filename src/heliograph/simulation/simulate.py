@@ -148,7 +148,7 @@ def _has_long_step(network: "Network") -> bool:
 
 
 def _return_with_warnings(result: Result, network: Network) -> Result:
-    """Return the result as it is; warn if it is a record with values that are not finite or states beyond limits."""
+    """Return the result as it is; warn if it is a record with numbers that are not finite or states beyond limits."""
     if isinstance(result, Record):
         _warn_beyond_limits(result, network)
         complete = [name for name, node in network.nodes.items() if isinstance(node, Node) and node.complete]
@@ -188,8 +188,9 @@ def _warn_of_numbers_lost_in_float32(network: Network) -> None:
     In single precision these numbers count as 0.
     """
     sensors = [node.sensor for node in network.nodes.values() if isinstance(node, Node)]
-    leaves = [np.asarray(leaf) for leaf in jax.tree.leaves((network.plant, sensors)) if eqx.is_inexact_array(leaf)]
-    if any(0 < np.max(np.abs(leaf), initial=0.0) < np.finfo(np.float32).tiny for leaf in leaves):
+    arrays = [np.asarray(leaf) for leaf in jax.tree.leaves((network.plant, sensors)) if eqx.is_inexact_array(leaf)]
+    largest = [np.max(np.abs(array), initial=0.0) for array in arrays]
+    if any(0 < size < np.finfo(np.float32).tiny for size in largest):
         finding = "single precision: numbers of plant or sensors below 1.2e-38 count as 0"
         warnings.warn(f"{finding}; choose larger units, or float64", stacklevel=3)
 
@@ -219,6 +220,7 @@ class _SimulationJob(Module):
 def _run_chunks(job: _SimulationJob, first_run: int, runs: int, chunk: int, progress: Progress | None) -> ReducedRuns:
     """Simulate all runs, chunk by chunk, in lanes side by side: return the sums over them, and what is collected."""
     with jax.enable_x64(True):
+        # Blocks of runs are dealt to lanes: each computed by a thread of its own (`alone`), or all `together`.
         lanes = RunLanes(
             alone=lambda blocks, carry: _simulate_lane((job, blocks), carry),
             together=partial(_simulate_all_lanes, job),
@@ -273,7 +275,7 @@ def _simulate_all_lanes(job: _SimulationJob, blocks: PyTree, carries: PyTree) ->
 
 
 def _simulate_block(job: _SimulationJob, runs: jax.Array) -> tuple[tuple[PyTree, PyTree], PyTree]:
-    """Return the sums and the flags of one block of runs, by batch, and what is collected, (run, time, ...)."""
+    """Return ((sums, counts of runs with a flag), collected) of a block: by batch, and collected (run, time, ...)."""
     recorded = _reduce(job.reducer, job.later, _simulate_outputs(job, runs))
     # The last block may have runs beyond the last one; run r belongs to batch r mod BATCHES.
     valid, start = jnp.asarray(runs) < job.stop, runs[0] % BATCHES
@@ -356,7 +358,7 @@ def _convert_to_single(leaf: PyTree) -> PyTree:
 
 
 def _simulate_world(world: World, u: PyTree, key: jax.Array, runs: jax.Array) -> PyTree:
-    """Return the trajectories of these runs, by number, (run, time, ...)."""
+    """Return the trajectories of these runs, by number, (run, time, ...), of plant, channels and filters."""
     keys = jax.vmap(lambda run: jax.random.fold_in(key, run))(runs)
     return simulate_trajectories(world.init, world.step, keys, (jnp.arange(len(u)), jnp.asarray(u)))
 

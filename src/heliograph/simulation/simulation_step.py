@@ -68,23 +68,24 @@ class World(Module):
             group (why senders with a trigger sent), and all that `AllFilters.step` puts out, with estimated angles
             within half a turn of the true ones.
         """
-        (x, medium, states, edges, modes), (k, u) = carry, row
+        x, medium, states, edges, modes = carry
+        k, u = row
         # The plant moves, in the present modes of its memories, and its nodes receive.
         plant = condition_on_memories(at(self.plant, k), modes)
         x = plant.plus(plant.transition(x, u), plant.sample_noise(draw_key(key, k, WORLD, PROCESS), u))
         medium, z = self.medium.receive(medium, x, u, key, k)
         # Measurements that always arrive in full are marked, so that native code need not look for NaN.
         z = tuple(present(values) if full else values for values, full in zip(z, self.filters.complete, strict=True))
-        # Draw which reports and messages between neighbours arrive; then step all filters.
-        drawn: dict[str, PyTree] = {
-            name: by_report.uplinks.draw(key, k) for name, by_report in self.filters.reporting.items()
-        }
-        drawn_edges = {name: mesh.edges.draw(edges[name], key, k) for name, mesh in self.filters.meshes.items()}
-        edges = {name: state for name, (state, _) in drawn_edges.items()}
-        drawn |= {name: arrived for name, (_, arrived) in drawn_edges.items()}
+        # Draw which reports to a centre and which messages between neighbours arrive; then step all filters.
+        drawn: dict[str, PyTree] = {}
+        edges_after: dict[str, PyTree] = {}
+        for name, by_report in self.filters.reporting.items():
+            drawn[name] = by_report.uplinks.draw(key, k)
+        for name, mesh in self.filters.meshes.items():
+            edges_after[name], drawn[name] = mesh.edges.draw(edges[name], key, k)
         states, outputs = self.filters.step(states, z, u, k, drawn)
         modes = move_modes(self.plant, modes, key, k, self._memory_numbers)
-        after = x, self.medium.feed_back(medium, outputs["estimates"]), states, edges, modes
+        after = x, self.medium.feed_back(medium, outputs["estimates"]), states, edges_after, modes
         results = {
             "truth": x,
             "measurements": z,

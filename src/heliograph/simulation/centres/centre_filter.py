@@ -88,8 +88,9 @@ class CentreFilter(AbstractSizedFilter):
 
         The centre estimates the plant's state, all nodes' errors, and the reports that may still arrive late.
         """
-        filter_states, _, _, centre_states, *_ = self.filters.init()
-        errors = centre_states[0].errors
+        # Of all initial states those of the nodes' filters by stack, and those of centres, of which there is one.
+        filter_states, _, _, (centre_state,), *_ = self.filters.init()
+        errors = centre_state.errors
         longest_delay = self.ages - 1  # ages of reports are 0, 1, ... steps
         joint_estimate = make_initial_belief(
             errors, delays=longest_delay, received=self.widest, quantized=self.quantized

@@ -118,7 +118,11 @@ class CrossCovariances:
         )
 
     def _check_relays(self, relays: Mapping[str, Sequence[str]]) -> None:
-        """Raise ValueError unless each relay receives some of the nodes, and no node has two relays."""
+        """Raise ValueError unless each relay receives some of the nodes, and no node has two relays.
+
+        `relays`: names of the nodes that each relay receives. A node with two relays would make their errors dependent
+        in a way that the factors do not hold.
+        """
         received_nodes = [name for names in relays.values() for name in names]
         unknown = sorted(set(received_nodes) - set(self.nodes))
         if not relays or unknown or not all(relays.values()):
@@ -165,7 +169,8 @@ def cross_covariances(
     Source: Bar-Shalom, On the track-to-track correlation problem (1981), with the second moments of random gains.
     """
     instance("network", network, Network, "a Network")
-    # The errors of nodes are followed for a fusion with matrix weights, so one is made of the filters of this name.
+    # A centre that fuses with matrix weights propagates the joint covariance of the nodes' errors: make one for the
+    # filters of this name, in a network without other fusions.
     fusion = Fusion(filter, MatrixWeights())
     alone = Network(network.plant, network.nodes, {"all": fusion}, network.relays, network.common)
     filters, u = _plan_network_filters(alone, horizon, inputs)
@@ -207,6 +212,9 @@ def fused_covariances(
 def _plan_network_filters(network: Network, horizon: int, inputs: ArrayLike | None) -> tuple[AllFilters, np.ndarray]:
     """Return the network's filters, planned for the inputs, and the inputs (horizon, inputs).
 
+    An informed fusion is one by a rule that needs the joint covariance of the nodes' errors. Everything that depends on
+    no data, such as gains, is computed ahead.
+
     Raises:
         ValueError: no informed fusion, senders that decide when to transmit, or filters whose gains depend on data.
     """
@@ -229,7 +237,7 @@ def _compute_joint_error_factors(filters: AllFilters, u: np.ndarray) -> SourceFa
     `filters` has one fusion by the errors' joint covariance, whose centre has the models of the errors' recursion.
     """
     (centre,) = filters.linear_centres
-    filter_states, _, _, (centre_state,), *_ = filters.init()
+    filter_states, _, _, (centre_state,), *_ = filters.init()  # of the nodes' filters, and of the one centre
     nodes, n = centre_state.errors.bias.shape  # mean errors (node, n)
     # Each step adds sources: n of the plant's noise and, where nodes share their measurement noises, as many as all
     # nodes receive numbers.
@@ -246,12 +254,17 @@ def _compute_joint_error_factors(filters: AllFilters, u: np.ndarray) -> SourceFa
 
 @quickly_compiled
 def _compute_fused_covariances(filters: AllFilters, u: np.ndarray) -> PyTree:
-    """Return the covariances (time, n, n) of all fused estimates, by name, over the steps of u."""
+    """Return the covariances (time, n, n) of all fused estimates, by name, over the steps of u.
+
+    Gains depend on no data, so that covariances are propagated alone: those of the nodes' filters, whose gains they
+    give, and with these gains the joint covariance of all errors in each fusion centre.
+    """
 
     def step(carry: tuple[PyTree, PyTree], row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
         """Step all covariances: of the nodes' filters, and of the centres by these filters' matrices.
 
-        Covariances do not depend on data, so means are taken as 0.
+        Covariances do not depend on data, so means are taken as 0. `centre.sources`: (stack, number in it) of each
+        filter that a centre fuses; a stack has filters that differ in numbers alone.
         """
         states, centre_states = carry
         k, u_k = row
@@ -265,6 +278,6 @@ def _compute_fused_covariances(filters: AllFilters, u: np.ndarray) -> PyTree:
             covariances |= {name: jnp.asarray(estimate.covariance) for name, estimate in estimates.items()}
         return (filters.step_without_data(states, u_k, k), tuple(next_centre_states)), covariances
 
-    states, _, _, centre_states, *_ = filters.init()
+    states, _, _, centre_states, *_ = filters.init()  # of the nodes' filters by stack, and of the centres
     _, covariances = jax.lax.scan(step, (states, centre_states), (jnp.arange(len(u)), jnp.asarray(u)))
     return covariances

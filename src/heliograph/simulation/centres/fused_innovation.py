@@ -183,12 +183,16 @@ def make_fused_innovations(network: Network, stacks: Sequence[StackedFilters]) -
             sources, _ = find_source_filters(
                 network, indices_by_filter, network.nodes_with(fusion.filter), fusion.filter
             )
-            # Each filter's state is to be a mean and a covariance of the plant's states, and no more.
-            beliefs = [eqx.filter_eval_shape(stacks[stack].init) for stack, _ in sources]
-            if all(isinstance(b, WHOLE) and gaussian_of(b).mean.shape[-1] == len(network.states) for b in beliefs):
+            if all(_is_gaussian_of_states(stacks[stack], len(network.states)) for stack, _ in sources):
                 start = in_float64(from_covariance)(
                     np.asarray(plant.initial_mean), np.asarray(plant.initial_covariance)
                 )
                 # NumPy arrays, so that the test is a constant and takes no device.
                 tests[name] = FusedInnovation(jax.tree.map(np.asarray, start), sources)
     return tests
+
+
+def _is_gaussian_of_states(stacked: StackedFilters, n: int) -> bool:
+    """Return whether the filters' states are a mean and a covariance of the plant's n states, and no more."""
+    state = eqx.filter_eval_shape(stacked.init)  # its shapes alone
+    return isinstance(state, WHOLE) and gaussian_of(state).mean.shape[-1] == n

@@ -100,8 +100,8 @@ class FusionCentre(Module):
     def propagate_error_factors(
         self,
         start: tuple[PyTree, SourceFactors],
-        compute_matrices: Callable[..., LinearStep],
-        step_filters: Callable[..., PyTree],
+        compute_matrices: Callable[[PyTree, jax.Array, jax.Array], LinearStep],
+        step_filters: Callable[[PyTree, jax.Array, jax.Array], PyTree],
         u: Array,
     ) -> SourceFactors:
         """Return the factors of the errors' joint covariance after all steps.
@@ -118,10 +118,13 @@ class FusionCentre(Module):
         def propagate(
             carry: tuple[PyTree, SourceFactors], row: tuple[jax.Array, jax.Array]
         ) -> tuple[tuple[PyTree, SourceFactors], None]:
-            """Step the filters' states over step k, and the factors of the errors' covariance by their matrices."""
+            """Step the filters' states over step k, and the factors of the errors' covariance by their matrices.
+
+            Row 0 of the means `factors.mean` is the plant's state x, and Cov x = S S' with S = `factors.state`. `row`:
+            (number of the step, inputs of the plant over it).
+            """
             states, factors = carry
             k, u_k = row
-            # The plant's state has row 0 of the means, and its covariance is S S' with the factor S = factors.state.
             covariance = jnp.asarray(factors.state @ factors.state.T)
             matrices = compute_matrices(states, u_k, k)
             step = self.compute_error_maps(factors.mean[0], covariance, matrices, u_k, k)
@@ -133,7 +136,8 @@ class FusionCentre(Module):
     def gather_matrices(self, matrices_by_source: Sequence[LinearStep]) -> LinearStep:
         """Return the filters' matrices in the order of the nodes, padded with zeros to the longest measurement.
 
-        `matrices_by_source`: of each stack of filters, with a leading axis of nodes.
+        `matrices_by_source`: of each stack of filters (of one structure, at the nodes of a group), with a leading axis
+        of nodes.
         """
         return join_step_matrices(matrices_by_source, self.order, self.size)
 
@@ -174,16 +178,18 @@ Matrices = TypeVar("Matrices", LinearStep, LinearisedStep)
 def join_step_matrices(matrices_by_source: Sequence[Matrices], order: np.ndarray, size: int) -> Matrices:
     """Return the matrices of several stacks of filters as one stack: one stack after another, then in this order.
 
-    Axes as long as the measurement are padded with zeros to `size`.
+    A stack has the filters of some nodes, of one structure. Axes as long as the measurement may differ between stacks:
+    they are padded with zeros to `size`. `order` sorts the joined rows by node.
     """
 
     def pad(name: str, leaf: jax.Array) -> jax.Array:
         """Return the matrix that is the field `name`, with its measurement axes padded to `size`.
 
-        MEASURED: by field the axes, counted from the last, that are as long as a measurement.
+        MEASURED: by field the axes, counted from the last (-1), that are as long as a measurement.
         """
-        measurement_axes = {leaf.ndim + axis for axis in MEASURED.get(name, ())}
-        padding = [(0, size - n) if axis in measurement_axes else (0, 0) for axis, n in enumerate(leaf.shape)]
+        padding = [(0, 0)] * leaf.ndim  # zeros before and after, along each axis
+        for axis in MEASURED.get(name, ()):
+            padding[axis] = (0, size - leaf.shape[axis])
         return jnp.pad(leaf, padding)
 
     matrices_class = type(matrices_by_source[0])
@@ -233,7 +239,11 @@ def has_data_dependent_gains(nodes: NodeModels) -> bool:
 
 
 def _check_data_dependent_gains(rule: str, nodes: NodeModels, shared: bool) -> None:
-    """Raise ValueError unless all filters are cubature or extended ones, and the nodes share no channel."""
+    """Raise ValueError unless all filters are cubature or extended ones, and the nodes share no channel.
+
+    The joint covariance of the errors is then propagated along the estimates, with derivatives of each filter's step:
+    all filters must have such, and their measurement noises must be independent.
+    """
     for name, (_, _, filter) in nodes.items():
         if not isinstance(filter, GaussianFilter) or filter.linear:
             raise fail(f"fusion by {rule}: node {name!r}", "a cubature or extended filter, as other nodes have", filter)
@@ -243,7 +253,11 @@ def _check_data_dependent_gains(rule: str, nodes: NodeModels, shared: bool) -> N
 
 
 def _check_linear_and_planned(rule: str, plant: AnyPlant, nodes: NodeModels) -> None:
-    """Raise unless plant and sensors are linear, and the gains of all filters depend on no data."""
+    """Raise ValueError unless plant and sensors are linear, and the gains of all filters depend on no data.
+
+    Then the joint covariance of the nodes' errors can be propagated before any data. `rule`: name of the fusion rule,
+    for errors. `nodes`: sensor, channel and filter of each node.
+    """
     if not isinstance(first(plant), LinearPlant):
         raise fail(f"fusion by {rule}", "a LinearPlant", type(first(plant)).__name__)
     for name, (sensor, _, filter) in nodes.items():
@@ -279,7 +293,8 @@ def find_claim_of_report_fusion(rule: str, claim: Claim, fusion: Fusion, complet
 def _has_uncertain_law(channel: Channel) -> bool:
     """Return whether the channel's laws have probabilities that are known only up to a radius.
 
-    The set of possible laws then has several extreme laws (its vertices), and a law that is known has one.
+    The set of possible laws then has several extreme laws (its corners), and a law that is known has one. A channel
+    that varies over time is judged at each step.
     """
     try:
         return any(step.condition_on_arrival().corner_count() > 1 for step in unstack(channel))

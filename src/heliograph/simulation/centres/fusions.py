@@ -115,8 +115,9 @@ class StackedFusions(Module):
     def _gather_by_fusion(self, values_by_stack: Sequence[jax.Array | np.ndarray]) -> jax.Array:
         """Return values of the filters as (fusion, node, ...), in the order of each fusion's nodes.
 
-        `values_by_stack`: (filter, node, ...) for each stack of filters. `self.sources`: for each fusion, the pairs
-        (stack, filter) that it fuses. `self.order`: for each fusion, the order of their joined rows.
+        `values_by_stack`: (filter, node, ...) for each stack of filters of one structure. `self.sources`: for each
+        fusion, the pairs (stack, number of the filter in it) that it fuses. `self.order`: for each fusion, the order of
+        their joined rows.
         """
         values_by_fusion = [
             jnp.concatenate([values_by_stack[stack][filter] for stack, filter in sources]) for sources in self.sources
@@ -250,14 +251,17 @@ def _keep_one_filter(node: Node | ReceivingNode, name: str) -> Node | ReceivingN
 def list_stacked_fusions(network: Network) -> tuple[StackedFusions, ...]:
     """Return the network's fusions by rules that need nothing but the estimates, those of one structure stacked.
 
+    Fusions that differ in numbers alone are stacked along a leading axis, so that one vectorised program computes all.
     Rules that need the joint covariance of the nodes' errors (`AbstractInformedFusion`) are left out.
     """
     names_by_structure: dict[object, list[str]] = {}
     for name, fusion in network.fused.items():
         if isinstance(fusion, Fusion) and not isinstance(fusion.rule, AbstractInformedFusion):
             nodes = network.nodes_with(fusion.filter)
-            # Fusions stack if their rules and quantizers have one structure, and they fuse equally many nodes.
-            key = structure_key((fusion.rule, fusion.uplinks(nodes), (None,) * len(nodes)))
+            # Fusions stack if their rules and quantizers have one structure, and they fuse equally many nodes: a tuple
+            # of None, one for each node, makes their number part of the structure.
+            node_count = (None,) * len(nodes)
+            key = structure_key((fusion.rule, fusion.uplinks(nodes), node_count))
             names_by_structure.setdefault(key, []).append(name)
     indices_by_filter, claims = network.estimate_indices, network.claims().get(FUSED, {})
     return tuple(
@@ -275,6 +279,9 @@ def _stack_fusions(
     """Return the fusions of these names, of one structure, stacked.
 
     `indices_by_filter`: of all estimates, by (node, filter). `claims`: of each fusion.
+
+    A claim is what a covariance is said to be: exact, an upper bound, or nominal. `fusion.uplinks`: the quantizers
+    through which a node's estimate is sent, or None.
     """
     fusions = [fusion for fusion in (network.fused[name] for name in names) if isinstance(fusion, Fusion)]
     sources, orders, quantizers = [], [], []
@@ -360,8 +367,8 @@ def find_source_filters(
     indices = [indices_by_filter[node, name] for node in nodes]
     sources = tuple(dict.fromkeys((index.stack, index.filter) for index in indices))  # each once, in order
     # The row of each node, if the sources' rows stand one source after another.
-    groups = [network.groups[network.stacks[stack].group] for stack, _ in sources]
-    row_of_node = {node: row for row, node in enumerate(node for names in groups for node in names)}
+    nodes_in_rows = [node for stack, _ in sources for node in network.groups[network.stacks[stack].group]]
+    row_of_node = {node: row for row, node in enumerate(nodes_in_rows)}
     return sources, np.array([row_of_node[node] for node in nodes])
 
 

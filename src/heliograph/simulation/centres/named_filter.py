@@ -44,11 +44,12 @@ def find_filter_by_name(network: Network, name: str, node: str | None = None) ->
     Raises:
         ValueError: no network, no such name or place, a fusion of finished estimates.
     """
-    # {place: {filter: claim}}, from which the places that have a filter of this name are read.
+    # Places that have a filter of this name, read from the claims {place: {filter: claim}} of all estimates.
     claims = instance("network", network, Network, "a Network").claims()
-    places = [place for place, of_place in claims.items() if text("filter", name) in of_place]
+    text("filter", name)
+    places = [place for place, claims_at_place in claims.items() if name in claims_at_place]
     if not places:
-        known = sorted({f for of_place in claims.values() for f in of_place})
+        known = sorted({label for claims_at_place in claims.values() for label in claims_at_place})
         raise fail("filter", f"one of the network's filters {known}", repr(name))
     if node is None and len(places) > 1:
         raise fail("node", f"one of {places}, which all have a filter {name!r}", "none")
@@ -91,7 +92,8 @@ def _name_reports(network: Network, fusion: Fusion) -> list[str]:
     nodes = network.nodes_with(fusion.filter)
     uplinks = build_uplinks(fusion, nodes, len(network.states))
     names = []
-    for age in range(uplinks.delay.shape[1]):
+    ages = uplinks.delay.shape[1]
+    for age in range(ages):
         suffix = f"_{age}_late" if age else ""  # age: steps between sending and arrival
         for node, link, size in zip(nodes, fusion.links(nodes), uplinks.received, strict=True):
             numbers = network.states if link.channel is None else [f"report{i}" for i in range(size)]
@@ -105,9 +107,13 @@ def _find_between_neighbours(network: Network, name: str, node: str) -> NamedFil
     A message has the neighbour's mean, its covariance (row after row) and its measurement. The numbers are named
     NEIGHBOUR_mean_STATE, NEIGHBOUR_covariance_STATE_STATE and NEIGHBOUR_NUMBER.
     """
+    states = network.states
+    means = [f"mean_{state}" for state in states]
+    covariances = [f"covariance_{state}_{other}" for state in states for other in states]
+    # The node's own measurement, then the message of each neighbour.
     names = list(network.nodes[node].received_names)
-    for sender in (network.meshes[name].neighbours or {})[node]:
-        pairs = [f"{a}_{b}" for a in network.states for b in network.states]
-        numbers = [f"mean_{state}" for state in network.states] + [f"covariance_{pair}" for pair in pairs]
-        names += [f"{sender}_{number}" for number in (*numbers, *network.nodes[sender].received_names)]
+    neighbours = network.meshes[name].neighbours or {}
+    for sender in neighbours[node]:
+        measurement = network.nodes[sender].received_names
+        names += [f"{sender}_{number}" for number in (*means, *covariances, *measurement)]
     return NamedFilter(node, node_filter(network, name, node), tuple(names))

@@ -82,22 +82,25 @@ class SeparateObservations(Module):
     counts: tuple[int, ...] = eqx.field(static=True, default=())
 
     def observe(self, mean: jax.Array, covariance: jax.Array, k: jax.Array) -> JointObservation:
-        """Return the nodes' measurement models at step k, in the order of the nodes, for a plant with these moments.
+        """Return gain (node, m, n), offset (node, m) and noise (node, m, m) of z_i = gain_i x + offset_i + noise_i.
 
-        `self.groups`: the stacked models of each group of nodes, or None for nodes without a sensor, whose models are
-        zeros. `self.counts`: the number of nodes of each group. `self.size`: the length of the longest measurement, to
-        which all are padded. `self.order`: sorts the joined rows by node.
+        z_i is what node i of all nodes receives at step k, padded with zeros to m numbers, the length of the longest.
+        `mean` (n,) and `covariance` (n, n): of the plant's state x, on which the noise of random gains depends.
         """
         m, n = self.size, len(mean)
         models_by_group = []
         for i, group in enumerate(self.groups):
-            if group is None:
-                shapes = (m, n), (m,), (m, m)
-                models_by_group.append(JointObservation(*(jnp.zeros((self.counts[i], *shape)) for shape in shapes)))
+            if group is None:  # nodes without a sensor, which measure nothing
+                nodes = self.counts[i]
+                nothing = JointObservation(
+                    gain=jnp.zeros((nodes, m, n)), offset=jnp.zeros((nodes, m)), noise=jnp.zeros((nodes, m, m))
+                )
+                models_by_group.append(nothing)
             else:
                 models_by_group.append(group.observe(mean, covariance, k, m))
-        joined = (jnp.concatenate(fields) for fields in zip(*models_by_group, strict=True))
-        return JointObservation(*(field[self.order] for field in joined))
+        # The nodes of all groups, one group after another; then in the order of the nodes.
+        gain, offset, noise = (jnp.concatenate(fields)[self.order] for fields in zip(*models_by_group, strict=True))
+        return JointObservation(gain, offset, noise)
 
 
 class SharedObservation(Module):

@@ -236,14 +236,16 @@ def _propagate_leaves(leaves: _Leaves, numbers: PyTree, u: np.ndarray) -> ErrorS
 def _fuse_level_of_relays(errors: ErrorSources, degree: int) -> tuple[np.ndarray, ErrorSources]:
     """Return the weights (relay, n, child, n) of one level of relays, and the errors of their estimates.
 
-    `errors`: the errors of the nodes below. Each relay fuses the next `degree` nodes, its children. The last relay may
-    have fewer, and its weights are padded with zeros.
+    `errors`: the errors of the nodes below, with a leading axis of nodes. Each relay fuses the next `degree` nodes, its
+    children. The last relay may have fewer, and its weights are padded with zeros.
     """
-    groups = [_take_rows(errors, slice(i, i + degree)) for i in range(0, len(errors.independent), degree)]
-    outputs = [to_numpy(_fuse_at_relay(group)) for group in groups]
-    weights = np.stack([_pad_to_degree(relay_weights, degree) for relay_weights, _ in outputs])
-    relay_errors = [error for _, error in outputs]
-    return weights, jax.tree.map(lambda *leaves: np.stack(leaves), *relay_errors)
+    weights, relay_errors = [], []
+    for start in range(0, len(errors.independent), degree):
+        children = _take_rows(errors, slice(start, start + degree))
+        relay_weights, relay_error = to_numpy(_fuse_at_relay(children))
+        weights.append(_pad_to_degree(relay_weights, degree))
+        relay_errors.append(relay_error)
+    return np.stack(weights), jax.tree.map(lambda *leaves: np.stack(leaves), *relay_errors)
 
 
 @quickly_compiled
@@ -279,7 +281,9 @@ def _take_rows(numbers: PyTree, rows: int | slice) -> PyTree:
 
 def _count_leaves(numbers: PyTree) -> int:
     """Return how many nodes the arrays have along their leading axis; raise ValueError if lengths differ or are 0."""
-    lengths = {np.shape(leaf)[0] if np.ndim(leaf) else None for leaf in jax.tree.leaves(numbers)}
-    if len(lengths) != 1 or lengths & {None, 0}:
+    # Lengths of all leading axes, None of a number without axes: there has to be one length, above 0.
+    arrays = jax.tree.leaves(numbers)
+    lengths = {np.shape(leaf)[0] if np.ndim(leaf) else None for leaf in arrays}
+    if len(lengths) != 1 or None in lengths or 0 in lengths:
         raise fail("numbers of the leaves", "arrays with one leading axis of nodes", sorted(map(str, lengths)))
-    return len(jax.tree.leaves(numbers)[0])
+    return len(arrays[0])

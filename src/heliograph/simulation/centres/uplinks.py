@@ -97,7 +97,11 @@ class Uplinks(Module):
         return np.flatnonzero(np.broadcast_to(is_number, (ages, *is_number.shape)))
 
     def init(self) -> ReportsInTransit:
-        """Return the state with no report in transit from the nodes to the centre."""
+        """Return the state with no report in transit from the nodes to the centre.
+
+        It has a row for each age of 1, 2, ... steps that a report can reach on its way, and the initial states of the
+        quantizers, by which nodes send reports in few bits.
+        """
         nodes, ages = self.delay.shape
         values = jnp.full((ages - 1, nodes, max(self.received)), jnp.nan)  # NaN: nothing was sent
 
@@ -243,7 +247,8 @@ class Uplinks(Module):
 def _draw_links(group: ChannelGroup, delay: jax.Array, key: jax.Array, k: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Draw the matrices [G n; 0 1] (channel, m + 1, n + 1) of a group's channels at step k, and their delays in steps.
 
-    G: the gain. n: the offset with its noise. `delay` (channel, ages): the probability of each delay.
+    A group has the channels of some nodes, of one structure, stacked. G: the gain. n: the offset with its noise.
+    `delay` (channel, ages): the probability of each delay.
     """
 
     def draw_link(channel: Channel, source: jax.Array, probabilities: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -257,21 +262,29 @@ def _draw_links(group: ChannelGroup, delay: jax.Array, key: jax.Array, k: jax.Ar
 
 
 def build_uplinks(fusion: Fusion, nodes: Sequence[str], n: int) -> Uplinks:
-    """Return the uplinks of these nodes to the centre of a fusion by reports of n numbers."""
+    """Return the uplinks of these nodes to the centre of a fusion by reports of n numbers.
+
+    A node's report is its estimate of n numbers; on its way to the centre it may be rounded by a quantizer, and scaled,
+    lost or delayed by a random channel.
+    """
     links, quantizers = fusion.links(nodes), fusion.quantizers(nodes)
-    ages = max(len(link.delay) for link in links)
     channels = [perfect(n) if link.channel is None else link.channel for link in links]
-    # Without a channel, and with one certain delay each, nothing is drawn.
-    random = any(link.channel is not None or np.max(link.delay) < 1 for link in links)
-    named = {f"{node} to the fusion centre": channel for node, channel in zip(nodes, channels, strict=True)}
-    # Received numbers of each node, and bounds on the quantizers' errors.
+    # Nothing is drawn if no link has a channel, and each has one delay of probability 1.
+    is_random = any(link.channel is not None or np.max(link.delay) < 1 for link in links)
+    channel_by_name = {f"{node} to the fusion centre": channel for node, channel in zip(nodes, channels, strict=True)}
+    # Probabilities of delays of 0, 1, ... steps, padded with zeros to the longest delay of all links.
+    ages = max(len(link.delay) for link in links)
+    delay = np.stack([np.pad(link.delay, (0, ages - len(link.delay))) for link in links])
+    # How many numbers arrive of each node's report, and bounds on the quantizers' errors.
     received = tuple(link.received(n) for link in links)
-    error = np.stack([q.error(n) for q in quantizers]) if quantizers else np.zeros((len(nodes), n))
+    error = np.stack([quantizer.error(n) for quantizer in quantizers]) if quantizers else np.zeros((len(nodes), n))
+    groups = group_channels(channel_by_name) if is_random else ()
+    moments = [compute_channel_moments(channel) for channel in channels]
     return Uplinks(
-        groups=group_channels(named) if random else (),
+        groups=groups,
         quantizers=stack(quantizers) if quantizers else None,
-        links=_make_link_models([compute_channel_moments(channel) for channel in channels], received, error),
-        delay=np.stack([np.pad(link.delay, (0, ages - len(link.delay))) for link in links]),
+        links=_make_link_models(moments, received, error),
+        delay=delay,
         every=np.array([link.every for link in links], float),  # arguments of the program, which others share
         received=received,
         n=n,

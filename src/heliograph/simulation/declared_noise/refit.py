@@ -163,8 +163,10 @@ def list_links_declaring_noise(filter: ToldFilter) -> list[int]:
 
     Links are numbered among those that report any numbers, in the filter's order (`list_told_maps`).
     """
-    maps = list_told_maps(filter.link) if isinstance(filter.link, AbstractRandomAffine) else []
-    return [number for number, affine in enumerate(maps) if isinstance(affine, ToldMap) and _declares_noise(affine)]
+    if not isinstance(filter.link, AbstractRandomAffine):  # one that varies over time is not judged
+        return []
+    reporting_links = list_told_maps(filter.link)
+    return [i for i, link in enumerate(reporting_links) if isinstance(link, ToldMap) and _declares_noise(link)]
 
 
 @in_float64

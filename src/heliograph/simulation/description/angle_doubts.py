@@ -71,7 +71,7 @@ def _list_directions(filter: AbstractFilter) -> list[_Direction]:
 
 
 def _find_wide(direction: _Direction, deviation: Float[np.ndarray, "rows n"]) -> tuple[np.ndarray, list[int]]:
-    """Return the rows in which an angle, or an axis of an attitude, is too wide, and the states that are, in any row.
+    """Return the rows in which an angle, or an axis of an attitude, is too wide, and the states that are in some row.
 
     `deviation`: standard deviations of all states in each row.
     """
@@ -86,7 +86,10 @@ def _join_names(states: Sequence[int], names: Sequence[str]) -> str:
 
 
 def doubt_wide_angles_at_start(network: Network) -> Iterator[str]:
-    """Yield a line for each angle, and each attitude, that starts wider than the filter can use."""
+    """Yield a line for each angle, and each attitude, that starts wider than the filter can use.
+
+    The deviation is that of the filter before any data. Nodes whose filters of one name start alike share a line.
+    """
     nodes_by_angle: dict[tuple[str, str, float, str], list[str]] = {}
     for node, label, filter in _yield_filters_with_angles(network):
         deviation = _find_deviations(np.asarray(filter.estimate(filter.init()).covariance)[None])
@@ -103,7 +106,11 @@ def doubt_wide_angles_at_start(network: Network) -> Iterator[str]:
 
 
 def doubt_wide_angles_in_rows(network: Network, record: Record) -> Iterator[str]:
-    """Yield a line for each filter and angle, or attitude, that was too wide in some row for the filter."""
+    """Yield a line for each filter and angle, or attitude, that was too wide in some row for the filter.
+
+    `record`: estimates of a recording. A row is too wide where the claimed deviation is above the largest at which the
+    filter can take the angle for Gaussian.
+    """
     for node, label, filter in _yield_filters_with_angles(network):
         deviation = _find_deviations(np.asarray(record.estimates[node][label].covariance))
         for direction in _list_directions(filter):
@@ -141,11 +148,17 @@ class WideAngles:
     """
 
     def __init__(self, filter: AbstractFilter, names: Sequence[str] = ()):
-        """Name the angles among the filter's states and received numbers; find the largest deviation it can use."""
+        """Name the angles among the filter's states and received numbers; find the largest deviation it can use.
+
+        `names`: names of the received numbers for the lines, by default measurement[0] and so on.
+        """
         instance("filter", filter, AbstractFilter, "a filter")
-        angles = None if filter.claim == "none" else filter.angles_used()
-        self._directions, self._names = _list_directions(filter), filter.states
+        self._names = filter.states
+        # Angles and attitudes among the states that were not yet too wide, each with its largest usable deviation.
+        self._directions = _list_directions(filter)
         self.states = {i: filter.states[i] for direction in self._directions for i in direction.states}
+        # Angles among the received numbers, by index.
+        angles = None if filter.claim == "none" else filter.angles_used()
         if not isinstance(names, Sequence) or len(names) not in (0, filter.received):
             raise fail("names", f"those of {filter.received} received numbers", show_value(names))
         names = list(names) or [f"measurement[{i}]" for i in range(filter.received)]
@@ -182,7 +195,10 @@ class WideAngles:
 
 
 def _yield_filters_with_angles(network: Network) -> Iterator[tuple[str, str, AbstractFilter]]:
-    """Yield (node, name, filter) of each filter that has angles or attitudes; the node of central ones is FUSED."""
+    """Yield (node, name, filter) of each filter that has angles or attitudes among its states.
+
+    Filters of all nodes' measurements come last, under FUSED in place of a node.
+    """
     plant = first(network.plant)
     if not plant.circular and not plant.attitude:
         return
@@ -230,7 +246,11 @@ def doubt_degrees(name: str, value: float) -> str:
 
 
 def doubt_angles_beyond_a_turn(network: Network, z: dict[str, Float[np.ndarray, "steps m"]]) -> Iterator[str]:
-    """Yield a line for each measured angle with values beyond a full turn (TURN, 2 pi): they may be degrees."""
+    """Yield a line for each measured angle with values beyond a full turn (TURN, 2 pi): they may be degrees.
+
+    `z`: measurements by node, NaN where nothing arrived. The line says how many values of the angle are beyond a turn,
+    and the first.
+    """
     for name, angles in network.angles.items():
         names = network.nodes[name].received_names if angles else ()
         for i in angles:

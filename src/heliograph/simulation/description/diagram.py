@@ -27,7 +27,11 @@ class DiagramLine(NamedTuple):
 
 
 def list_diagram_lines(network: HasNodes) -> list[DiagramLine]:
-    """Return a line for each part of a network, in the order in which data flow: from the plant to fused estimates."""
+    """Return a line for each part of a network, in the order in which data flow: from the plant to fused estimates.
+
+    Nodes that are described in the same words share a line. Estimates come with their claims, what their covariances
+    are said to be: exact, an upper bound or nominal.
+    """
     plant = first(network.plant)
     inputs = f"; inputs {', '.join(network.inputs)}" if network.inputs else ""
     parts = [DiagramLine("plant", f"{type(plant).__name__} of {', '.join(network.states)}{inputs}")]
@@ -52,7 +56,11 @@ def list_diagram_lines(network: HasNodes) -> list[DiagramLine]:
 
 
 def claims_in_words(network: HasNodes) -> dict[str, dict[str, str]]:
-    """Return the claim of each estimate by node and filter, and which of its models differ from the node's own."""
+    """Return the claim of each estimate by node and filter, and which of its models differ from the node's own.
+
+    A claim says what a covariance is: exact, an upper bound, nominal, or none. An entry is such as "nominal, believes
+    another channel".
+    """
     words: dict[str, dict[str, str]] = {node: dict(by_name) for node, by_name in network.claims().items()}
     for belief in yield_mistaken_beliefs(network):
         words[belief.node][belief.filter] += f", believes {belief.another}"
@@ -67,7 +75,7 @@ def _describe_node(network: HasNodes, name: str, claims: Mapping[str, str]) -> s
     """
     node = network.nodes[name]
     filters = ", ".join(f"{label} ({claim})" for label, claim in claims.items()) or "no filter of its own"
-    if isinstance(node, Node):
+    if isinstance(node, Node):  # it has a sensor and a channel of its own
         return ARROW.join([", ".join(node.outputs), link_in_words(node.channel), filters])
     if network.common is not None:
         rows = network.rows[name]
@@ -76,13 +84,19 @@ def _describe_node(network: HasNodes, name: str, claims: Mapping[str, str]) -> s
 
 
 def _list_senders(relays: RelayNetwork | None, name: str) -> str:
-    """Return in words who sends to a node in any slot."""
-    slots = () if relays is None else relays.slots
-    return join_names(list(dict.fromkeys(sender for slot in slots for sender in slot.get(name, {}))))
+    """Return in words who sends to a node in any slot, a turn of the relays' schedule: {listener: {sender: hop}}."""
+    senders: list[str] = []
+    for slot in () if relays is None else relays.slots:
+        senders += slot.get(name, {})
+    return join_names(list(dict.fromkeys(senders)))  # each once
 
 
 def list_shared_in_words(network: HasNodes) -> list[str]:
-    """Return what several nodes share, in words: a common channel, or the memory of their links."""
+    """Return what several nodes share, in words: a common channel, or the memory of their links.
+
+    Links share fading if their channels have the same memory, a state that is random over time: it is drawn once for
+    all of them.
+    """
     if network.common is not None:
         return [f"sensor and channel of all nodes: {link_in_words(network.common.channel)}"]
     channels = {name: node.channel for name, node in network.nodes.items() if isinstance(node, Node)}
@@ -111,7 +125,10 @@ def write_diagram(network: HasNodes) -> str:
 
 
 def write_short_diagram(network: HasNodes) -> str:
-    """Return the diagram cut to LINES lines, each cut to the usual length; … stands for what is left out."""
+    """Return the diagram cut to LINES lines, each cut to the usual length; … stands for what is left out.
+
+    It is what `repr` of a network shows.
+    """
     lines = _format_lines(network)
     if len(lines) > LINES:
         hidden = len(lines) - (LINES - 1)
@@ -120,10 +137,11 @@ def write_short_diagram(network: HasNodes) -> str:
 
 
 def _format_lines(network: HasNodes) -> list[str]:
-    """Return the diagram's title, and a line for each part with its name in a column."""
-    lines = list_diagram_lines(network)
-    width = max(len(line.name) for line in lines)
-    return [_make_title(network), *(f"{line.name:{width}}  {line.words}" for line in lines)]
+    """Return the diagram's title, and a line for each part of the network: its name, padded to a column, and words."""
+    parts = list_diagram_lines(network)
+    width = max(len(part.name) for part in parts)
+    lines = [f"{part.name:{width}}  {part.words}" for part in parts]
+    return [_make_title(network), *lines]
 
 
 def _make_title(network: HasNodes) -> str:

@@ -127,7 +127,11 @@ def _doubt_states_at_limits(network: Network, record: Record) -> Iterator[str]:
 
 
 def _yield_filters_with_covariance(network: Network) -> Iterator[tuple[str, str, AbstractFilter, Sequence[AnySensor]]]:
-    """Yield (node, name, filter, sensors whose signals it receives) for every filter that claims a covariance."""
+    """Yield (node, name, filter, sensors whose signals it receives) for every filter that claims a covariance.
+
+    A node behind relays, and a filter of all nodes' measurements (under FUSED in place of a node), receive signals of
+    all sensors.
+    """
     all_sensors = list_sensors(network)
     for name, node in network.nodes.items():
         sensors = [node.sensor] if isinstance(node, Node) else all_sensors  # others hear what several nodes send

@@ -16,9 +16,11 @@ from heliograph.model.assumed.same_plant_and_sensor import find_sensor_matrix
 from heliograph.model.channel_side_information import separate_told_numbers
 from heliograph.model.fading import memory_matters
 from heliograph.model.over_time import at_each_step, first
+from heliograph.model.sensor import AbstractSensor
 from heliograph.numerics.check import InputError, instance
 from heliograph.numerics.module import readable
 from heliograph.numerics.numpy_or_jax import DOUBLE
+from heliograph.numerics.types import Float
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.channel_state_information import list_told_maps
 from heliograph.random_affine.modes import redraw_modes_each_step
@@ -67,32 +69,35 @@ def doubts_before_data(network: Network) -> list[Doubt]:
         ValueError: what is no network.
     """
     instance("network", network, Network, "a Network")
-    # Serious: states that no sensor observes, errors without a bound, links that carry nothing, filters that ignore a
-    # link's memory, filters that assume other models than the true ones, angles.
-    lines = [*_doubt_unobservable_states(network), *_doubt_boundedness(network), *_doubt_useless_links(network)]
-    lines += [*_doubt_forgetful_filters(network), *_doubt_mistaken_beliefs(network)]
-    lines += [Doubt(True, words) for words in (*doubt_wide_angles_at_start(network), *doubt_degrees_at_start(network))]
-    # Good to know: lost digits, links that fail together, slow computation, noise that messages declare, and nodes that
-    # are independent of each other.
-    lines += [Doubt(False, f"digits: {words}; make tables {DOUBLE}") for words in list_rounded_numbers(network)]
-    lines += [Doubt(False, f"shared, so that losses come together: {words}") for words in list_shared_in_words(network)]
-    lines += [Doubt(False, f"by XLA, which takes longer: {words}") for words in explain_xla_fallbacks(network)]
+    # States that no sensor observes, errors without a bound, links that carry nothing, filters that ignore a link's
+    # memory, filters that assume other models than the true ones.
+    doubts = [*_doubt_unobservable_states(network), *_doubt_boundedness(network), *_doubt_useless_links(network)]
+    doubts += [*_doubt_forgetful_filters(network), *_doubt_mistaken_beliefs(network)]
+    # In words alone: serious ones on angles; then lost digits, links that fail together, and slow computation.
+    serious = [*doubt_wide_angles_at_start(network), *doubt_degrees_at_start(network)]
+    notes = [f"digits: {words}; make tables {DOUBLE}" for words in list_rounded_numbers(network)]
+    notes += [f"shared, so that losses come together: {words}" for words in list_shared_in_words(network)]
+    notes += [f"by XLA, which takes longer: {words}" for words in explain_xla_fallbacks(network)]
     if sequential := describe_sequential_filters(network):
-        lines.append(
-            Doubt(False, f"row by row however long a recording is, since not linear in its data: {sequential}")
-        )
-    lines += [
-        *_doubt_declared_noise(network),
-        *_doubt_told_numbers_without_claim(network),
-        *_doubt_overloaded_words(network),
-    ]
+        notes.append(f"row by row however long a recording is, since not linear in its data: {sequential}")
+    doubts += [Doubt(serious=True, words=words) for words in serious]
+    doubts += [Doubt(serious=False, words=words) for words in notes]
+    # Noise that messages declare, links that report what is not the whole truth, words of few bits.
+    doubts += [*_doubt_declared_noise(network), *_doubt_told_numbers_without_claim(network)]
+    doubts += [*_doubt_overloaded_words(network), *_doubt_independent_nodes(network)]
+    return sorted(doubts, key=lambda doubt: not doubt.serious)
+
+
+def _doubt_independent_nodes(network: Network) -> Iterator[Doubt]:
+    """Yield a line if nodes measure states that nothing couples: each part could be a network of its own.
+
+    Parts that are estimated together cost more than apart, and estimate nothing better.
+    """
     parts = separate_nodes(network)
     if len(parts) > 1:
         words = f"independent: nothing couples what {join_names([repr(names[0]) for names in parts])} measure"
-        lines.append(
-            Doubt(False, f"{words}; a plant of each, a fleet, is estimated as well, starts sooner, costs less")
-        )
-    return sorted(lines, key=lambda doubt: not doubt.serious)
+        advice = "a plant of each, a fleet, is estimated as well, starts sooner, costs less"
+        yield Doubt(serious=False, words=f"{words}; {advice}")
 
 
 def _doubt_overloaded_words(network: Network) -> Iterator[Doubt]:
@@ -111,7 +116,8 @@ def _doubt_unobservable_states(network: Network) -> Iterator[Doubt]:
 
     They are the null space of the observability matrix, the derivatives of all outputs with respect to the state.
     """
-    # At a state drawn around the initial mean, since a symmetric point may hide what every other one shows.
+    # At a state drawn around the initial mean: at the mean itself, often a point of symmetry, a nonlinear sensor may
+    # have a derivative of zero that it has nowhere else.
     plant = first(network.plant)
     deviation = np.sqrt(np.diagonal(np.asarray(plant.initial_covariance)))
     state = np.asarray(plant.initial_mean) + deviation * np.random.default_rng(SEED).normal(size=len(plant.states))
@@ -119,7 +125,7 @@ def _doubt_unobservable_states(network: Network) -> Iterator[Doubt]:
     if not np.isfinite(matrix).all():
         yield Doubt(False, "observability: not judged, the derivatives of plant or sensors are no numbers")
         return
-    # Rows and then columns scaled to length 1, so that no unit matters; those of zeros stay.
+    # Rows (outputs) and then columns (states) scaled to length 1, so that no unit matters; those of zeros stay.
     row_lengths = np.linalg.norm(matrix, axis=1, keepdims=True)
     rows = matrix / np.where(row_lengths > 0, row_lengths, 1.0)
     column_lengths = np.linalg.norm(rows, axis=0)
@@ -135,7 +141,11 @@ def _doubt_unobservable_states(network: Network) -> Iterator[Doubt]:
 
 
 def _doubt_boundedness(network: Network) -> Iterator[Doubt]:
-    """Yield what is known before data on whether errors stay bounded: of all nodes together, and of each alone."""
+    """Yield what is known before data on whether errors stay bounded: of all nodes together, and of each alone.
+
+    Where nodes are many, more than NODES_LIMIT, each alone is not judged. A node's own error that grows is serious only
+    where nothing is fused, as the node is then all that there is.
+    """
     # All nodes together, then each that has filters.
     yield from _doubt_error_bound(network, "the mean error of every filter", serious=True)
     nodes_with_filters = [name for name, node in network.nodes.items() if isinstance(node, Node) and node.filters]
@@ -171,42 +181,69 @@ def _doubt_error_bound(network: Network, what: str, serious: bool) -> Iterator[D
 
 
 def _has_undecided_senders(network: Network) -> bool:
-    """Return whether values decide what some node uses, or words stand for it: then all else is undecided."""
+    """Return whether at some node data decide what is used (trigger, limits), or codewords stand for numbers.
+
+    `certify_boundedness` is always undecided then, so that "undecided" is no news.
+    """
     return any(isinstance(node, Node) and node.disturbs_what_is_sent for node in network.nodes.values())
 
 
 def _doubt_useless_links(network: Network) -> Iterator[Doubt]:
-    """Yield doubts on sums of links whose mean gains cancel, and links of mean gain zero, useless to linear filters."""
+    """Yield doubts on links that add up at a node, z = sum_i G_i y_i + n, and are useless to a linear filter.
+
+    That is so of all together where their mean gains cancel, and of one whose mean gain is zero.
+    """
     for name, node in network.nodes.items():
-        if not isinstance(node, Node):
+        channel = first(node.channel) if isinstance(node, Node) else None
+        if not isinstance(node, Node) or not isinstance(channel, Superposed):
             continue
-        channel = first(node.channel)
-        if not isinstance(channel, Superposed):
-            continue
-        # E z = sum_i E[G_i] y_i, y_i the outputs that link i carries: by states where the sensor is a matrix.
-        links = [np.asarray(redraw_modes_each_step(link).moments(1).mean)[:-1, :-1] for link in channel.maps]
-        matrix = find_sensor_matrix(first(node.sensor)) if not channel.past else None
-        sensed = np.eye(channel.inputs) if matrix is None else np.asarray(matrix)
-        heard = [mean @ sensed[list(outputs)] for mean, outputs in zip(links, channel.places, strict=True)]
-        if not np.any(np.abs(sum(heard)) > CANCELLED * sum(np.abs(mean) for mean in heard)):
+        gains = [_compute_mean_gain(link) for link in channel.maps]
+        if _do_gains_cancel(channel, gains, first(node.sensor)):
             advice = "a linear filter learns nothing of it; compensate phases and signs at the transmitters"
             yield Doubt(serious=True, words=f"unheard: what adds up at {name!r} has mean gain 0: {advice}")
             continue
-        silent = [f"link{i}" for i, mean in enumerate(links, 1) if not np.any(mean)]
+        silent = [f"link{i}" for i, gain in enumerate(gains, 1) if not np.any(gain)]
         if silent:
             yield Doubt(False, f"unheard: {join_names(silent)} at {name!r}: of mean gain 0, which only adds noise")
 
 
+def _compute_mean_gain(link: AbstractRandomAffine) -> Float[np.ndarray, "m p"]:
+    """Return E[G] of a link z = G y + n, over its fading and, where its modes have memory, over their long-run law."""
+    mean = np.asarray(redraw_modes_each_step(link).moments(1).mean)  # [E G, E n; 0, 1]
+    return mean[:-1, :-1]
+
+
+def _do_gains_cancel(channel: Superposed, gains: list[Float[np.ndarray, "m p"]], sensor: AbstractSensor) -> bool:
+    """Return whether sum_i E[G_i] C_i = 0 up to rounding, so that the mean of z = sum_i G_i C_i x + n shows no state.
+
+    C_i are the rows of the sensor's matrix C that link i carries (`channel.places`). Where the sensor is not linear, or
+    the channel is late and so carries past signals too, C = I: it is judged by signals and not by states.
+
+    Args:
+        channel: the sum of links.
+        gains: E[G_i] of each link.
+        sensor: what measures the signals.
+    """
+    is_late = channel.past > 0
+    matrix = None if is_late else find_sensor_matrix(sensor)
+    sensed = np.eye(channel.inputs) if matrix is None else np.asarray(matrix)  # C
+    heard = [gain @ sensed[list(outputs)] for gain, outputs in zip(gains, channel.places, strict=True)]
+    return not np.any(np.abs(sum(heard)) > CANCELLED * sum(np.abs(mean) for mean in heard))
+
+
 def _doubt_declared_noise(network: Network) -> Iterator[Doubt]:
-    """Yield a line on the nodes whose messages declare the variance of their noise, which filters take for true."""
+    """Yield a line on the nodes whose messages declare the variance of their noise, which filters take for true.
+
+    A message may bring the variance of its own noise beside its value. Whether such variances are true shows only in
+    data.
+    """
     names = []
     for name, node in network.nodes.items():
-        told_filters = (
-            [filter for filter in node.filters.values() if isinstance(filter, ToldFilter)]
-            if isinstance(node, Node)
-            else []
-        )
-        if any(list_links_declaring_noise(filter) for filter in told_filters):
+        if not isinstance(node, Node):
+            continue
+        # A ToldFilter uses numbers that come with each message, such as this variance.
+        filters_using_numbers = [filter for filter in node.filters.values() if isinstance(filter, ToldFilter)]
+        if any(list_links_declaring_noise(filter) for filter in filters_using_numbers):
             names.append(name)
     if names:
         senders = join_names([repr(name) for name in names])
@@ -237,7 +274,7 @@ def _doubt_mistaken_beliefs(network: Network) -> Iterator[Doubt]:
     doubt is serious if the filter's claim of its covariance was lowered to "nominal" for this.
     """
     beliefs_by_line: dict[tuple[bool, str, tuple[str, ...]], list[MistakenBelief]] = {}
-    # For each filter the nodes where it ignores the memory of their links: another doubt tells of these.
+    # For each filter the nodes where it ignores the memory of their links: `_doubt_forgetful_filters` tells of these.
     nodes_with_ignored_memory = _list_forgetful_nodes(network)
     for belief in yield_mistaken_beliefs(network):
         if belief.parts == (CHANNEL,) and belief.node in nodes_with_ignored_memory.get(belief.filter, ()):
@@ -288,6 +325,10 @@ def _list_forgetful_nodes(network: Network) -> dict[str, list[str]]:
 
 
 def _ignores_memory(filter: AbstractFilter) -> bool:
-    """Return whether a filter, or the one that it wraps, has no model of memory."""
+    """Return whether a filter takes its link's gains for independent over time, though they may be correlated.
+
+    Filters of these two classes do: their state has no part for the channel's mode, which carries its memory from step
+    to step. Judged is a filter, or the one inside it where it wraps another (`base`).
+    """
     inner = getattr(filter, "base", filter)
     return isinstance(inner, GaussianFilter | LinearFilter)

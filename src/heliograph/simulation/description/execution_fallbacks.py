@@ -28,21 +28,30 @@ def explain_xla_fallbacks(network: Network) -> list[str]:
 
 
 def describe_sequential_filters(network: Network) -> str:
-    """Return which filters go row by row however long a recording is, "" if none does: those not linear in its data."""
+    """Return in words which filters go row by row however long a recording is, "" if none does.
+
+    They are those that are not linear in their data: linear ones can be run in chunks of rows side by side.
+    """
     sequential = [who for who, filter in _list_filters(network) if not filter.is_linear]
     return _join_first_names(sequential) if sequential else ""
 
 
 def _list_filters(network: Network) -> Iterator[tuple[str, AbstractFilter]]:
     """Yield (description in words, filter) for each filter of the network."""
-    central = {name: fusion for name, fusion in network.fused.items() if isinstance(fusion, AbstractFilter)}
-    filters_by_place = [(f" of node {name!r}", network.nodes[name].filters) for name in network.names]
-    for place_in_words, filters in (*filters_by_place, ("", central)):
-        yield from ((f"filter {label!r}{place_in_words}", filter) for label, filter in filters.items())
+    for node in network.names:
+        for label, filter in network.nodes[node].filters.items():
+            yield f"filter {label!r} of node {node!r}", filter
+    for label, fusion in network.fused.items():
+        if isinstance(fusion, AbstractFilter):  # a filter of all nodes' measurements
+            yield f"filter {label!r}", fusion
 
 
 def _find_refused_filters(network: Network) -> Iterator[tuple[str, str]]:
-    """Yield (name, reason) for each filter whose step native code refuses, so that XLA computes it."""
+    """Yield (name, reason) for each filter whose step native code refuses, so that XLA computes it.
+
+    Native code is the library's own compiler of straight-line code, faster than XLA; it does not know every operation.
+    The step is traced with zeros, which have the shapes of any data.
+    """
     for name, filter_with_names in _list_filters(network):
         filter = without_output_names(filter_with_names)  # so that filters of one structure are compiled once
         z, u = np.zeros(filter.received), np.zeros(len(filter.inputs))
@@ -57,7 +66,10 @@ def _step_filter(filter: AbstractFilter, *arguments: jax.Array) -> PyTree:
 
 
 def _find_refused_meshes(network: Network) -> Iterator[tuple[str, str]]:
-    """Yield (name, reason) for each fusion between neighbours whose step is too long to write out as native code."""
+    """Yield (name, reason) for each fusion between neighbours whose step is too long to write out as native code.
+
+    XLA computes it then, which takes longer to begin.
+    """
     for name, fusion in network.meshes.items():
         nodes = len(network.mesh_nodes(name))
         # A rule that needs the joint covariance of all errors cannot be built for more than DENSE nodes.

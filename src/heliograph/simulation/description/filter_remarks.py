@@ -13,22 +13,29 @@ Place = tuple[str, str]  # node and filter
 
 
 def find_remarking_filters(network: Network) -> tuple[Place, ...]:
-    """Return the places (node, name) of the filters that may remark on their state; FUSED is the centre's "node"."""
+    """Return the places (node, name) of the filters that may remark on their state; FUSED is the centre's "node".
+
+    A remark is what a filter has to say of its state after a run, such as how often its gate gave in. A filter of all
+    nodes' measurements stands at the centre.
+    """
     places = [(node, name) for node, name in network.estimate_indices if network.nodes[node].filters[name].remarks]
-    fused = [
-        (FUSED, name) for name, filter in network.fused.items() if isinstance(filter, AbstractFilter) and filter.remarks
-    ]
-    return *places, *fused
+    for name, fusion in network.fused.items():
+        if isinstance(fusion, AbstractFilter) and fusion.remarks:  # a filter of all nodes' measurements
+            places.append((FUSED, name))
+    return tuple(places)
 
 
 def yield_remarks(network: Network, state: PyTree) -> Iterator[tuple[Place, Remark]]:
     """Yield each remark that a filter makes on its state, with the filter's place.
 
+    A stack has filters of one structure, at nodes of one structure (a group). A place is (node, name), with FUSED in
+    place of the node of a central filter, which receives all measurements.
+
     Args:
         network: the network.
         state: states of all filters, as `NetworkFilters.init` returns them: stacks, then central ones by name.
     """
-    stacks, central, *_ = state
+    stacks, central, *_ = state  # states of the nodes' filters by stack, and of the central ones by name
     for node, name in find_remarking_filters(network):
         if node == FUSED:
             fusion = network.fused[name]
@@ -43,5 +50,5 @@ def yield_remarks(network: Network, state: PyTree) -> Iterator[tuple[Place, Rema
 
 
 def describe_remarks(network: Network, state: PyTree) -> list[str]:
-    """Return a line for each filter to whose state something happened."""
+    """Return a line for each filter that remarks on its state, if what it remarks on happened at least once."""
     return [f"{node}/{name}: {said.words}" for (node, name), said in yield_remarks(network, state) if said.times]

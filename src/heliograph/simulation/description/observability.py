@@ -16,10 +16,12 @@ from heliograph.simulation.node import Node
 
 
 def list_sensors(network: Network) -> list[AbstractSensor]:
-    """Return every sensor of the network, at its first step."""
+    """Return every sensor of the network, at its first step: of the nodes, common to all nodes, or behind relays."""
     sensors = [node.sensor for node in network.nodes.values() if isinstance(node, Node)]
-    sensors += [] if network.common is None else [network.common.sensor]
-    sensors += [] if network.relays is None else [network.relays.sensor]
+    if network.common is not None:
+        sensors.append(network.common.sensor)
+    if network.relays is not None:
+        sensors.append(network.relays.sensor)
     return [first(sensor) for sensor in sensors]
 
 
@@ -66,7 +68,11 @@ def _measure_from_states(
 def _measure_rows(
     plant: AbstractPlant, sensors: tuple[AbstractSensor, ...], x: jax.Array, rows: Int[Array, " steps"]
 ) -> jax.Array:
-    """Return y_1, ..., y_steps of all sensors from the state x in one row, one step for each entry of `rows`."""
+    """Return y_1, ..., y_steps of all sensors from the state x in one row, one step for each entry of `rows`.
+
+    There is no noise, and all inputs are 1. The result is flat: all outputs of the first step, then of the second, and
+    so on.
+    """
     u = jnp.ones(len(plant.inputs))
 
     def step(x: jax.Array, _: object) -> tuple[jax.Array, jax.Array]:

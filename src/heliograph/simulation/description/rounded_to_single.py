@@ -12,7 +12,7 @@ from heliograph.numerics.check import InputError
 from heliograph.numerics.numpy_or_jax import constants, find_rounded_to_single, is_traced
 from heliograph.simulation.node import HasNodes, Node
 
-Traced = tuple[Callable[..., Any], tuple[np.ndarray, ...]]
+Traced = tuple[Callable[..., Any], tuple[np.ndarray, ...]]  # a function, and arguments to trace it with
 
 
 def find_rounded_parts(network: HasNodes) -> dict[tuple[float, float], list[str]]:
@@ -20,7 +20,7 @@ def find_rounded_parts(network: HasNodes) -> dict[tuple[float, float], list[str]
 
     Only numbers that were rounded to single precision count, and only the first such number of each model.
     """
-    names_by_number: dict[tuple[float, float], list[str]] = {}
+    names_by_number: dict[tuple[float, float], list[str]] = {}  # by (number as meant, number as rounded)
     first_rounded: dict[int, tuple[float, float] | None] = {}  # by id of the model, as nodes may share a model
     for name, model, functions in _yield_models_with_calls(network):
         if id(model) not in first_rounded:
@@ -54,7 +54,9 @@ def _yield_models_with_calls(network: HasNodes) -> Iterator[tuple[str, object, l
 
 def _yield_arrays(model: object, functions: list[Traced]) -> Iterator[Any]:
     """Yield the arrays of a model, and those that its functions hold."""
-    yield from (x for x in jax.tree.leaves(model) if isinstance(x, jax.Array | np.ndarray) and not is_traced(x))
+    for leaf in jax.tree.leaves(model):
+        if isinstance(leaf, jax.Array | np.ndarray) and not is_traced(leaf):
+            yield leaf
     for function, arguments in functions:
         yield from _collect_arrays(function, *arguments)
 
@@ -62,7 +64,8 @@ def _yield_arrays(model: object, functions: list[Traced]) -> Iterator[Any]:
 def _collect_arrays(function: Callable[..., Any], *arguments: np.ndarray) -> list[Any]:
     """Return the arrays that a function of a model holds, found by tracing it with these arguments.
 
-    The list is empty if the function cannot be traced.
+    Such an array, of a user's own Python function, is in no field of the model: in its trace it is a constant. The list
+    is empty if the function cannot be traced.
     """
     try:
         arrays, *_ = constants(function, *arguments)

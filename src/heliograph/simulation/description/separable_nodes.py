@@ -22,15 +22,18 @@ def separate_nodes(network: Network) -> list[list[str]]:
     linear = isinstance(network.plant, LinearPlant) and all(isinstance(s, LinearSensor) for s in nodes.values())
     if not linear or len(nodes) < len(network.nodes):
         return [list(network.nodes)]
+    # A graph of the states: edges between those that the plant couples, or that one sensor measures.
     measured = {name: _mask_measured(sensor) for name, sensor in nodes.items()}
     coupled = _mask_coupled(network.plant)
     for states in measured.values():
         coupled |= states[:, None] & states
-    _, parts = connected_components(coupled, directed=False)
-    by_part: dict[int, list[str]] = {}
+    # Its connected components: `component` (states,) is the number of each state's.
+    _, component = connected_components(coupled, directed=False)
+    nodes_by_component: dict[int, list[str]] = {}
     for name, states in measured.items():
-        by_part.setdefault(int(parts[int(np.argmax(states))]), []).append(name)
-    return list(by_part.values())
+        first_measured = int(np.argmax(states))  # all states that a node measures are in one component
+        nodes_by_component.setdefault(int(component[first_measured]), []).append(name)
+    return list(nodes_by_component.values())
 
 
 def _mask_measured(sensor: object) -> Bool[np.ndarray, " states"]:

@@ -20,7 +20,8 @@ DENSE = 200  # most nodes whose joint covariance is propagated at every step
 def build_mesh(network: Network, name: str) -> Mesh:
     """Return the fusion `name` between neighbours of a network, ready to be stepped: its graph, edges and models.
 
-    In a mesh there is no centre: at each step every node fuses its own estimate with those that its neighbours send.
+    In such a fusion, a mesh, there is no centre: at each step every node fuses its own estimate with those that its
+    neighbours send. Nodes of one structure are a group of the network.
     """
     fusion = network.meshes[name]
     assert fusion.neighbours is not None
@@ -32,7 +33,7 @@ def build_mesh(network: Network, name: str) -> Mesh:
     for part in graph.buckets():
         members, width = part.senders[:, 0], part.senders.shape[1]
         buckets.append(NodeBucket(rule=fusion.rule.placed(part), rows=members, width=width))
-    # Place of each node among the results of all buckets, one after another: the inverse of the order of the members.
+    # Place of each node among the results of all buckets, which are joined one after another.
     ranks = np.argsort(np.concatenate([bucket.rows for bucket in buckets]))
     # For each group of nodes of one structure that has the mesh's estimates: the numbers of its nodes in the mesh.
     index = {node: i for i, node in enumerate(nodes)}
@@ -58,28 +59,31 @@ def _model_measurements(network: Network, nodes: Sequence[str]) -> SeparateObser
 
     Nodes of one group of the network have models of one structure, which are stacked.
     """
-    models_by_group: list[ObservationModel | None] = []
-    number_of_node: dict[str, int] = {}  # of each node among all, group after group
+    models_by_group: list[ObservationModel | None] = []  # None: nodes without a sensor
     for names in network.groups:
-        sensors = [node for node in map(network.nodes.__getitem__, names) if isinstance(node, Node)]
-        channels = [node.channel for node in sensors]
-        models_by_group.append(stack_nodes([node.sensor for node in sensors], channels) if sensors else None)
-        number_of_node |= {node: len(number_of_node) + i for i, node in enumerate(names)}
+        members = [network.nodes[name] for name in names]
+        with_sensor = [node for node in members if isinstance(node, Node)]  # all of a group, or none
+        sensors, channels = [node.sensor for node in with_sensor], [node.channel for node in with_sensor]
+        models_by_group.append(stack_nodes(sensors, channels) if with_sensor else None)
+    # Place of each node among all, group after group.
+    names_by_group = [name for names in network.groups for name in names]
+    place_of_node = {name: place for place, name in enumerate(names_by_group)}
     return SeparateObservations(
         groups=tuple(models_by_group),
-        order=np.array([number_of_node[node] for node in nodes]),
+        order=np.array([place_of_node[node] for node in nodes]),
         size=max(1, *(node.received for node in network.nodes.values())),
         counts=tuple(map(len, network.groups)),
     )
 
 
 def build_meshes(network: Network) -> dict[str, Mesh]:
-    """Return the network's fusions between neighbours by name, ready to be stepped.
+    """Return the network's fusions between neighbours (meshes) by name, ready to be stepped.
 
     Raises:
-        ValueError: too many nodes for a rule that follows the joint covariance of their errors.
+        ValueError: more than DENSE nodes with a rule that needs the joint covariance of all their errors at every step.
+            The message names two ways out: `freeze`, which takes a mean of that covariance once and for all, and rules
+            of covariance intersection, which do without it.
     """
-    # DENSE: the most nodes whose joint covariance is propagated.
     for name, fusion in network.meshes.items():
         nodes = len(network.mesh_nodes(name))
         if fusion.rule.needs_joint and nodes > DENSE:

@@ -113,11 +113,12 @@ def find_claim_of_mesh(name: str, fusion: Fusion, network: HasNodes) -> Claim:
     """
     claim_of_errors = find_claim_of_errors(name, fusion, network)
     nodes = [network.nodes[node] for node in network.mesh_nodes(name)]
-    senders = [node for node in nodes if isinstance(node, Node)]
-    is_disturbed = fusion.quantizer is not None or any(sender.disturbs_what_is_sent for sender in senders)
-    if is_disturbed or isinstance(fusion.rule, FrozenWeights):
+    is_disturbed = any(node.disturbs_what_is_sent for node in nodes if isinstance(node, Node))
+    if is_disturbed or fusion.quantizer is not None or isinstance(fusion.rule, FrozenWeights):
         return weakest([claim_of_errors, "nominal"])
-    return claim_of_errors if fusion.rule.needs_joint else weakest([claim_of_errors, "upper"])
+    if fusion.rule.needs_joint:  # it weighs by the joint covariance
+        return claim_of_errors
+    return weakest([claim_of_errors, "upper"])  # an intersection
 
 
 def _check_rule(what: str, fusion: Fusion, network: HasNodes) -> None:
@@ -227,8 +228,8 @@ def _check_losses(what: str, fusion: Fusion, network: HasNodes, graph: Graph) ->
     rates = [find_loss_decay(channel) for channel in links_by_edge(link, graph).values()]
     if any(rate is None for rate in rates):
         return
-    # Capacities -log p in whole units, as the search for a flow needs them; at most WIDEST, as good as infinite, of an
-    # edge that loses nothing.
+    # Capacities -log p (1e-300 in place of p = 0) in whole units of 1 / UNIT, as the search for a flow needs them. An
+    # edge that loses nothing has the capacity WIDEST, as good as infinite.
     exact = np.array([-np.log(max(float(rate or 0.0), 1e-300)) for rate in rates])
     capacities = np.minimum(np.round(UNIT * exact), WIDEST).astype(np.int32)
     # For each unstable mode: the least cut between the nodes that observe it and each other node.
@@ -237,7 +238,8 @@ def _check_losses(what: str, fusion: Fusion, network: HasNodes, graph: Graph) ->
         if abs(value) <= 1 + MODE:
             continue
         sees = np.array([_measures_mode(network.nodes[name], vector) for name in names])
-        # One node more, the source, with an edge to each node that measures the mode: too wide for a least cut.
+        # The graph with one node more, the source, and from it an edge to each node that measures the mode. No least
+        # cut takes these edges, whose capacity UNCUT is above all others.
         source = len(names)
         senders = np.concatenate([graph.edges[:, 0], np.full(sees.sum(), source)])
         receivers = np.concatenate([graph.edges[:, 1], np.flatnonzero(sees)])
@@ -305,7 +307,11 @@ def _scale_rows(h: np.ndarray) -> np.ndarray:
 
 
 def _get_gain_and_noise(node: Node) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean matrix H from the state to what a node receives, and the noise covariance R at a signal of 0."""
+    """Return the mean matrix H from the state to what a node receives, and the noise covariance R at a signal of 0.
+
+    The node receives z = G (C x + v) + n with a random gain G: H = E[G] C and R = E[G] Cov(v) E[G]' + Cov(n). The noise
+    that a random gain makes in proportion to the signal is left out.
+    """
     sensor, channel = first(node.sensor), second_order(first(node.channel).condition_on_arrival())
     assert isinstance(sensor, LinearSensor)  # as its filter's claim requires
     # `center` is the covariance of (gains, offset). At a signal of 0 only the offset's entry, the last, makes noise.
@@ -336,18 +342,20 @@ def _check_fixed_shares(what: str, fusion: Fusion, network: HasNodes, graph: Gra
         return
     a, q = np.asarray(plant.matrix), np.asarray(plant.noise_covariance(jnp.zeros(len(plant.inputs))))
     nodes = [network.nodes[name] for name in names]
-    # Judged where the plant does not decay, each edge's losses are independent over steps, and nodes are steady.
+    # Judged where the plant does not decay, each edge's losses are independent over steps (so that a message has one
+    # probability to arrive, which is None else), and nodes measure by one law at every step.
     links = [None] * len(graph.edges) if link is None else list(links_by_edge(link, graph).values())
-    rates = [find_arrival_probability(channel) for channel in links]
-    arrival = np.array([p for p in rates if p is not None])
-    steady = all(_measures_alike_at_each_step(node) for node in nodes if isinstance(node, Node))
-    if np.abs(np.linalg.eigvals(a)).max() < 1 - MODE or len(arrival) < len(rates) or not steady:
+    probabilities = [find_arrival_probability(channel) for channel in links]
+    arrival = np.array([p for p in probabilities if p is not None])
+    are_independent = len(arrival) == len(probabilities)
+    is_decaying = np.abs(np.linalg.eigvals(a)).max() < 1 - MODE
+    are_steady = all(_measures_alike_at_each_step(node) for node in nodes if isinstance(node, Node))
+    if is_decaying or not are_independent or not are_steady:
         return
-    # A node without a sensor measures zeros, with a noise that does not matter.
-    models = [
-        _get_gain_and_noise(node) if isinstance(node, Node) else (np.zeros((1, len(a))), np.eye(1)) for node in nodes
-    ]
-    squares = np.array([h.T @ np.linalg.solve(noise, h) for h, noise in models])
+    # H' R^-1 H of each node. One without a sensor measures zeros, with a noise that does not matter.
+    nothing = np.zeros((1, len(a))), np.eye(1)
+    models = [_get_gain_and_noise(node) if isinstance(node, Node) else nothing for node in nodes]
+    squares = np.array([h.T @ np.linalg.solve(r, h) for h, r in models])
     shares = np.asarray(fusion.rule.placed(graph).shares).T
     check_error_decay(what, graph, shares, arrival, (a, q), squares)
 

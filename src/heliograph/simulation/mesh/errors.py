@@ -161,6 +161,7 @@ def propagate_errors_over_time(
     with jax.enable_x64(True):
         start = to_numpy(mesh.init())
     # Before any data all nodes have the same error, x_0 - E x_0: every block of the joint covariance J is Cov x_0.
+    # `moments`: mean and covariance of the plant's state x before any data; `covariance`: what rules weigh by.
     covariance, moments = start.covariance, start.plant
     _, initial_covariance = start.plant
     count, n = start.mean.shape
@@ -306,7 +307,7 @@ def compute_full_step(mesh: Mesh, covariance: np.ndarray, moments: PyTree, u: np
 
 
 def _extend_known_data(known: Any, mesh: Mesh, present: np.ndarray) -> Any:
-    """Return which nodes' data reach which node, with one more exchange put before those already counted.
+    """Return which nodes' data reach which node, with one more exchange between neighbours put before those counted.
 
     `known`: sparse (node, node), a one where data of the column's node reach the row's node. `present`: which messages
     arrive in the new exchange (node, degree).

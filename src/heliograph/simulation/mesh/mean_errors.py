@@ -118,8 +118,12 @@ def mean_mesh_errors(
 
 
 def _list_patterns(mesh: Mesh, fusion: Fusion) -> tuple[ArrivalPatterns, Mesh]:
-    """Return all patterns of arriving messages that a node can have in a step, and the mesh with a row for each."""
+    """Return all patterns of arriving messages that a node can have in a step, and the mesh with a row for each.
+
+    A pattern says of each neighbour's message whether it arrives.
+    """
     graph = graph_of(fusion.neighbours or {}, mesh.nodes)
+    # The probability that a message arrives, for each edge from neighbour to neighbour; without links all arrive.
     links = {} if fusion.link is None else links_by_edge(fusion.link, graph)
     chances = [_get_known_probability(name, link) for name, link in links.items()] or [1.0] * len(graph.edges)
     patterns = _compute_pattern_probabilities(mesh, np.array(chances))
@@ -131,9 +135,12 @@ def _repeat_nodes_by_pattern(mesh: Mesh, rule: AbstractFusion, patterns: Arrival
 
     A pattern says which messages reach the node. `rule`: the fusion rule, with nodes as the last axis of its arrays.
     """
-    rule = jax.tree.map(lambda leaf: leaf[..., patterns.node] if eqx.is_array(leaf) else leaf, rule)
-    bucket = NodeBucket(rule, np.arange(len(patterns.node)), mesh.senders.shape[1])
-    repeated: Mesh = eqx.tree_at(lambda m: (m.senders, m.buckets), mesh, (mesh.senders[patterns.node], (bucket,)))
+    node_of_row = patterns.node  # several rows of one node have the same numbers
+    rule_of_rows = jax.tree.map(lambda leaf: leaf[..., node_of_row] if eqx.is_array(leaf) else leaf, rule)
+    # All rows are computed together, as one bucket of the mesh.
+    bucket = NodeBucket(rule=rule_of_rows, rows=np.arange(len(node_of_row)), width=mesh.senders.shape[1])
+    senders = mesh.senders[node_of_row]
+    repeated: Mesh = eqx.tree_at(lambda m: (m.senders, m.buckets), mesh, (senders, (bucket,)))
     return repeated
 
 
@@ -142,6 +149,8 @@ def _compute_gains_by_pattern(
     rows: Mesh, covariance: np.ndarray, blocks: np.ndarray, patterns: ArrivalPatterns, step: MeshStep
 ) -> NodeGains:
     """Return the gains of a node for each pattern of arriving messages, with a leading axis of patterns.
+
+    A pattern says which of its neighbours' messages reach a node in the step.
 
     Args:
         rows: the mesh with a row for each pattern of each node, instead of one for each node.
@@ -241,7 +250,11 @@ def _compute_pattern_probabilities(mesh: Mesh, chances: np.ndarray) -> ArrivalPa
 
 
 def _get_known_probability(edge: str, link: Channel) -> float:
-    """Return the probability that a message of this edge arrives; raise unless losses are independent over steps."""
+    """Return the probability that a message of this edge arrives; raise unless losses are independent over steps.
+
+    A mean over losses in bursts would need the state of each link. For these the error names `mesh_errors`, which gives
+    the errors for one drawn sequence of arrivals. `edge`: the edge's name, for the error.
+    """
     chance = find_arrival_probability(link)
     if chance is None:
         expected = "losses that are independent over steps (mesh_errors of drawn arrivals for others)"

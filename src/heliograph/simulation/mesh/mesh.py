@@ -82,7 +82,7 @@ class Mesh(Module):
 
     @property
     def has_long_step(self) -> bool:
-        """Return whether a step has more than MESH operations, which is too many to write out as native code."""
+        """Whether a step has more than MESH operations: too many to write out one by one as native code."""
         n = len(first(self.plant).states)
         # About n^2 operations for each message, and 2 N^2 for a joint covariance of N = (number of nodes) n numbers.
         messages = self.edges.rounds * int(np.count_nonzero(self.edges.present))
@@ -319,7 +319,7 @@ class Mesh(Module):
         return jnp.tensordot(self.find_known_measurements(arrived).astype(values.dtype), values, 1)
 
     def find_known_measurements(self, arrived: Arrived) -> Bool[jax.Array, "node node"]:
-        """Return for each node (row) whether it has each node's (column) measurement after all rounds."""
+        """Return which nodes' measurements (column) each node (row) has after all rounds, by the messages `arrived`."""
         has_measurement, arrived = jnp.eye(len(self.senders), dtype=bool), jnp.asarray(arrived)
         # In each round a node gets all measurements that the senders of its arriving messages had before the round.
         for round_number in range(self.edges.rounds):

@@ -221,12 +221,17 @@ def links_by_edge(link: Channel | Mapping[str, Channel], graph: Graph) -> dict[s
     An edge is a pair of neighbours. `link`: one link for all edges, or a link for each name.
     """
     names = [f"{graph.nodes[sender]} to {graph.nodes[receiver]}" for sender, receiver in graph.edges]
+    # One link for each name; raises, with these words, where a name has none.
     title, label = "links between neighbours", "edge SENDER to RECEIVER"
     return dict(zip(names, spread_over_names(title, link, names, label), strict=True))
 
 
 def check_edge(what: str, link: Channel) -> None:
-    """Raise ValueError if a link changes its messages, or if the receiver does not know of its losses or delays."""
+    """Raise ValueError if a link changes its messages, or if the receiver does not know of its losses or delays.
+
+    Neighbours weigh an estimate that they received as if it were the sender's: a link may lose or delay it, but not
+    change it. `what`: the link in words, for the error.
+    """
     instance(what, first(link), AbstractRandomAffine, "a channel such as erasure(perfect(), 0.8)")
     for step in unstack(link):
         # The receiver knows a delay that is the same for all messages, or is stamped on the message.

@@ -69,7 +69,10 @@ class NodeFilter(AbstractSizedFilter):
 
     @in_float64
     def init(self) -> NodeState:
-        """Return the state before the first step: the plant's initial law, and no message on the way."""
+        """Return the state before the first step: the plant's initial law, and no message on the way.
+
+        A mesh is a fusion between neighbours: here one of this node alone, with its neighbours as senders.
+        """
         start = self.mesh.init()
         n, count = start.mean.shape[1], len(self.measured)
         # The mesh has the node and its neighbours. The first axis of the messages, by age, is empty: none is late.
@@ -99,12 +102,13 @@ class NodeFilter(AbstractSizedFilter):
         mean, covariance = state.now.mean[0], state.now.covariance[0]
         observation = self.mesh.observation_model.observe(*state.now.plant, jnp.asarray(k))
         measurements, _ = self._split_measurements(jnp.asarray(z), state.before)
-        sensors = [(i, size) for i, size in enumerate(self.measured) if size]
+        sensors = [(i, size) for i, size in enumerate(self.measured) if size]  # (number of the node, its numbers)
         if not sensors:
             return after, no_innovation()
         gain = jnp.concatenate([observation.gain[i, :size] for i, size in sensors])
         offset = jnp.concatenate([observation.offset[i, :size] for i, size in sensors])
         noise = block_diag(*(observation.noise[i, :size, :size] for i, size in sensors))
+        # Innovation z - (M x + o) of covariance S = M P M' + Cov nu, by the prediction x of covariance P.
         innovation_covariance = gain @ covariance @ gain.T + noise
         innovation = gaussian_innovation(jnp.concatenate(measurements), gain @ mean + offset, innovation_covariance)
         return after, innovation
@@ -116,9 +120,13 @@ class NodeFilter(AbstractSizedFilter):
 
     @in_float64
     def sent(self, before: MeshState) -> tuple[jax.Array, jax.Array]:
-        """Return the mean (n,) and covariance (n, n) that a message about the estimate before a step holds."""
-        message = before.mean[0], before.covariance[0]
-        return message if self.quantizer is None else _quantize_message(self.quantizer, *message)
+        """Return the mean (n,) and covariance (n, n) that a message about the estimate before a step holds.
+
+        With a quantizer the mean is rounded to few bits, and the covariance is widened by the bound of that error. The
+        node itself is row 0 of `before`.
+        """
+        mean, covariance = before.mean[0], before.covariance[0]
+        return (mean, covariance) if self.quantizer is None else _quantize_message(self.quantizer, mean, covariance)
 
     def _split_measurements(self, z: jax.Array, before: MeshState) -> tuple[list[jax.Array], MeshState]:
         """Return the measurements of the node and its neighbours in z, and `before` with the estimates in z.
@@ -178,14 +186,14 @@ def node_filter(network: Network, fusion: str, node: str) -> NodeFilter:
     # The graph of this node alone: itself first, then its neighbours, which only send.
     mesh = _build_one_node_mesh(network, fusion, node)
     # The filter receives the node's own measurement, then a message of each neighbour: the neighbour's mean (n),
-    # covariance (n, n) and measurement.
-    sizes = tuple(network.nodes[name].received for name in mesh.nodes)
-    own, *of_neighbours = sizes
+    # covariance (n, n) and measurement. `measured_by`: how many numbers the node and each neighbour measure.
+    measured_by = tuple(network.nodes[name].received for name in mesh.nodes)
+    own, *of_neighbours = measured_by
     filter = NodeFilter(
         mesh=mesh,
-        measured=sizes,
-        quantizer=next(iter(between.quantizers((node,))), None),
-        receivers=tuple(name for name in nodes if node in (between.neighbours or {})[name]),
+        measured=measured_by,
+        quantizer=next(iter(between.quantizers((node,))), None),  # the node's own, if it has one
+        receivers=tuple(name for name in nodes if node in (between.neighbours or {})[name]),  # whose neighbour it is
         claim=mesh.claim,
         states=network.states,
         inputs=network.inputs,
@@ -241,7 +249,11 @@ def _build_one_node_mesh(network: Network, fusion: str, node: str) -> Mesh:
 
 
 def _check_can_filter_alone(what: str, network: Network, between: Fusion) -> None:
-    """Raise ValueError if a node of the fusion `between` neighbours would have to know all other nodes to filter."""
+    """Raise ValueError if a node of the fusion `between` neighbours would have to know all other nodes to filter.
+
+    A node alone knows what its neighbours' messages hold: their estimates, covariances and measurements. `what`: the
+    filter in words, for the error.
+    """
     if between.rule.needs_joint:
         raise fail(what, "a rule that needs its neighbours' covariances alone (an intersection)",
                    type(between.rule).__name__)  # fmt: skip

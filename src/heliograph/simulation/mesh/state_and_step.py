@@ -191,13 +191,15 @@ def propagate_joint(
         senders: numbers of the neighbours from which each node receives (node, degree).
         present: True for a neighbour (node, degree); all other places only pad the rows to one length.
     """
-    gains, motion, size = step.gains, step.motion, joint.shape[0] * joint.shape[1]
-    # W of the measurements that arrived, else 0.
-    weights = measurement_weights(gains.gain, jnp.asarray(arrived))
-    # M, W S and W as matrices (N, N), N = nodes n, from their blocks (node, degree, n, n).
-    blocks = error_transitions(gains, motion.matrix), weights @ step.data.information[senders], weights
-    m, ws, w = (scatter_blocks(jnp.asarray(each), senders, present) for each in blocks)
+    gains, motion = step.gains, step.motion
+    # Blocks (node, degree, n, n) of W (0 for measurements that did not arrive), of M and of W S.
+    w_blocks = measurement_weights(gains.gain, jnp.asarray(arrived))
+    m_blocks = error_transitions(gains, motion.matrix)
+    ws_blocks = w_blocks @ step.data.information[senders]
+    # The same as matrices (N, N) of all nodes, N = nodes n.
+    m, ws, w = (scatter_blocks(jnp.asarray(blocks), senders, present) for blocks in (m_blocks, ws_blocks, w_blocks))
+    nodes, n = joint.shape[:2]
     covariance = propagate_joint_covariance(
-        joint.reshape(size, size), m, gains.correction_map, motion.noise, weighted_information=ws, weights=w
+        joint.reshape(nodes * n, nodes * n), m, gains.correction_map, motion.noise, weighted_information=ws, weights=w
     )
     return jnp.asarray(covariance).reshape(joint.shape)

@@ -147,8 +147,9 @@ def _warn_of_record(network: Network, record: Record, state: PyTree) -> None:
     `state`: states of all filters after the last row.
     """
     warn_of_non_finite_numbers(record)
-    doubts = *doubt_wide_angles_in_rows(network, record), *doubt_estimates(network, record)
-    _warn_of_each((*doubts, *_describe_left_out(network, record), *describe_remarks(network, state)))
+    lines = [*doubt_wide_angles_in_rows(network, record), *doubt_estimates(network, record)]
+    lines += [*_describe_left_out(network, record), *describe_remarks(network, state)]
+    _warn_of_each(lines)
 
 
 def _make_record(network: Network, smoothing: SmoothingPlan | None, outputs: PyTree, clock: np.ndarray) -> Record:
@@ -215,7 +216,13 @@ def _find_times(
 ) -> np.ndarray | None:
     """Return the times of the rows: `time`, or else the dates that the tables have; None if there are neither.
 
-    `measured`: tables of measurements by node. `other_tables`: further tables by name. `steps`: number of rows.
+    A table of pandas or xarray may have a date for each row. Tables whose dates differ are an error.
+
+    Args:
+        measured: tables of measurements by node.
+        other_tables: further tables by name.
+        time: numbers or dates of the rows; None where none are given.
+        steps: number of rows.
     """
     if time is not None:
         return check_times("time", time, steps)
@@ -328,15 +335,16 @@ def _find_refused_rows(
     Returns:
         {node: {row: reason}}.
     """
-    refused, refused_centrally = find_refused_rows(network, outputs)  # by the nodes' filters, and by central ones
-    filters, u = task.filters, task.u
-    # Try without one node's values at a time, from the central filters' states before the row.
+    # {node: {row: reason}} by the nodes' own filters, and {row: reason} by the central ones.
+    refused, refused_centrally = find_refused_rows(network, outputs)
     if refused_centrally:
+        # Try without one node's values at a time, from the central filters' states before the row. Nodes that can be
+        # blamed have no filter of their own, so that no entry of `refused` is replaced.
         central_states = find_central_states_before_rows(task, z_by_group)
         z_in_order = {name: z[name] for name in network.names}
         nodes_to_blame = JudgementReader(network).nodes_without_judge
         refused |= blame_nodes_for_implausible_rows(
-            filters.central, central_states, z_in_order, u, refused_centrally, nodes_to_blame
+            task.filters.central, central_states, z_in_order, task.u, refused_centrally, nodes_to_blame
         )
     # Leave out rows that were refused before.
     new_rows = {

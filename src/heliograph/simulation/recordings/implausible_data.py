@@ -20,14 +20,19 @@ Stepped = tuple[PyTree, dict[str, PyTree]]  # the filters' states after a step, 
 
 
 def is_implausible(outputs: Mapping[str, PyTree]) -> jax.Array:
-    """Return, within a program, whether some filter judges its measurement implausible; `outputs` of a step."""
-    flags = [jnp.any(j.implausible) for j in (*outputs["judged"], *outputs["judged_centrally"].values())]
+    """Return, within a program, whether some filter judges its measurement implausible.
+
+    `outputs`: of a step, with the filters' judgements "judged" by stack of filters, and "judged_centrally" by name.
+    """
+    judgements = [*outputs["judged"], *outputs["judged_centrally"].values()]
+    flags = [jnp.any(judgement.implausible) for judgement in judgements]
     return jnp.any(jnp.stack(flags)) if flags else jnp.asarray(False)
 
 
 def any_implausible(outputs: Mapping[str, PyTree]) -> bool:
     """Return whether some filter judged a measurement implausible, in stored `outputs` of many rows (NumPy arrays)."""
-    return any((j.reason > 0).any() for j in (*outputs["judged"], *outputs["judged_centrally"].values()))
+    judgements = [*outputs["judged"], *outputs["judged_centrally"].values()]
+    return any((judgement.reason > 0).any() for judgement in judgements)
 
 
 def read_refusal_reasons(outputs: Mapping[str, PyTree]) -> tuple[list[jax.Array], dict[str, jax.Array]]:
@@ -99,14 +104,21 @@ class JudgementReader:
     """The filters that judge what each node received; reads their judgements of a step, or of a recording's rows."""
 
     def __init__(self, network: Network):
-        """List, for each node, where its filters that receive measurements stand in the network's stacks of filters."""
+        """List, for each node, where its filters that receive measurements stand in the network's stacks of filters.
+
+        The place of a filter is (stack, number in the stack, number of the node): filters of one structure are stacked.
+        """
         self._indices: dict[str, list[EstimateIndex]] = {name: [] for name in network.names}
         for (node, name), index in network.estimate_indices.items():
             if network.nodes[node].filters[name].received:
                 self._indices[node].append(index)
 
     def read_node(self, outputs: Mapping[str, PyTree], node: str) -> Float[np.ndarray, "... filters 4"]:
-        """Return the judgements of the filters that receive from a node; where it has none, of the central ones."""
+        """Return the judgements of the filters that receive from a node: whether what arrived is plausible.
+
+        Where a node has no such filter, they are those of the central filters, which receive from all nodes. The last
+        axis has the four fields of a `Judgement`: distance, arrived, reason and input.
+        """
         return self._stack_judgements(outputs, self._indices[node], not self._indices[node])
 
     def read_all(self, outputs: Mapping[str, PyTree]) -> Float[np.ndarray, "... filters 4"]:
@@ -125,16 +137,24 @@ class JudgementReader:
     ) -> Float[np.ndarray, "... filters 4"]:
         """Return the judgements of these filters, followed by those of the central filters if `central` is True.
 
-        `indices`: (stack, filter, node) of each filter in the stacked outputs. The result has the recording's axes,
-        then filters, then the fields of a Judgement.
+        The result has the recording's axes (such as steps), then filters, then the four fields of a `Judgement`:
+        distance, arrived, reason and input.
+
+        Args:
+            outputs: "judged", by stack, judgements whose fields are (..., filter, node); "judged_centrally" by name of
+                the central filter, judgements whose fields are (...).
+            indices: where each filter stands in the stacked outputs: (stack, filter, node).
+            central: whether the central filters' follow.
         """
-        judgements = [
-            [field[..., index.filter, index.node] for field in outputs["judged"][index.stack]] for index in indices
-        ]
-        judgements += [list(judgement) for judgement in outputs["judged_centrally"].values()] if central else []
+        judgements = []  # of each filter a list of four arrays (...)
+        for index in indices:
+            judgements.append([field[..., index.filter, index.node] for field in outputs["judged"][index.stack]])
+        if central:
+            judgements += [list(judgement) for judgement in outputs["judged_centrally"].values()]
         if not judgements:
             return np.zeros((0, len(Judgement._fields)))
-        return np.moveaxis(np.array(judgements), (0, 1), (-2, -1))
+        by_filter_and_field = np.array(judgements)
+        return np.moveaxis(by_filter_and_field, (0, 1), (-2, -1))
 
     @property
     def nodes_without_judge(self) -> list[str]:
@@ -147,9 +167,9 @@ def find_refused_rows(
 ) -> tuple[dict[str, dict[int, str]], dict[int, str]]:
     """Return the rows that all filters of a node refuse, with the reason; first by node, then for central filters.
 
-    A filter refuses a measurement that it judges implausible. Central filters judge nodes that have no filters, all in
-    the same way, so the first of these nodes tells for all. `outcome`: the outputs of filtering the rows with
-    judgements.
+    A filter refuses a measurement that it judges implausible. Central filters, of all nodes' measurements, judge nodes
+    that have no filters, all in the same way, so the first of these nodes tells for all. `outcome`: the outputs of
+    filtering the rows with judgements.
     """
     reader, refused = JudgementReader(network), dict[str, dict[int, str]]()
     nodes_without_judge = reader.nodes_without_judge
@@ -165,8 +185,14 @@ def find_refused_rows(
 
 
 def _list_rows_refused_by_all(votes: Float[np.ndarray, "steps filters 4"]) -> dict[int, str]:
-    """Return the rows whose values all these filters refuse, with the reason."""
-    reasons_by_row = {row: Judgement.why_values(votes[row]) for row in _find_flagged(votes, "reason")}
+    """Return the rows whose values all these filters refuse, with the reason in words.
+
+    `votes`: the filters' judgements of each row; the last axis has the four fields of a `Judgement`: distance, arrived,
+    reason and input. A filter refuses a row where its reason, a code, is above 0. `Judgement.why_values` puts the
+    reason in words, and is None where some filter accepts the row.
+    """
+    rows_refused_by_some = _find_flagged(votes, "reason")
+    reasons_by_row = {row: Judgement.why_values(votes[row]) for row in rows_refused_by_some}
     return {row: reason for row, reason in reasons_by_row.items() if reason}
 
 
@@ -232,6 +258,8 @@ class _NonFiniteFunctionFinder:
         """Return "; " and what function of a filter returned no number in a row; "" where none did.
 
         `node`: where the filter `name` stands, FUSED for a central one.
+
+        Evaluated are the functions of the filter's models (such as the transition) at its estimate before the row.
         """
         central = node == FUSED
         filter = self.network.fused[name] if central else self.network.nodes[node].filters[name]
@@ -251,7 +279,8 @@ class _NonFiniteFunctionFinder:
 def _find_flagged(judgements: Float[np.ndarray, "steps filters 4"], field: str) -> list[int]:
     """Return the numbers of the rows in which this field of some filter's judgement is above 0.
 
-    `judgements`: their last axis holds the fields of a Judgement.
+    `judgements`: their last axis holds the fields of a `Judgement` (distance, arrived, reason, input). `field`:
+    "reason", a code that is above 0 for a refused measurement, or "input", 1 where an input is implausible.
     """
     if not judgements.size:
         return []
@@ -262,5 +291,7 @@ def _find_flagged(judgements: Float[np.ndarray, "steps filters 4"], field: str) 
 
 def _format_rows(rows: Sequence[int]) -> str:
     """Return "row 3 is", or "7 rows (1, 2, ...) are" with the first five, counted from 1."""
-    listed = ", ".join(str(k + 1) for k in rows[:5]) + (", ..." if len(rows) > 5 else "")
+    listed = ", ".join(str(k + 1) for k in rows[:5])
+    if len(rows) > 5:
+        listed += ", ..."
     return f"{len(rows)} rows ({listed}) are" if len(rows) > 1 else f"row {listed} is"

@@ -145,15 +145,24 @@ def _begin(fixed: tuple[AllFilters, PyTree]) -> PyTree:
 
 
 def _step_unjudged(fixed: tuple[AllFilters, PyTree], states: PyTree, row: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:
-    """Return the states of all filters after one row, and their outputs; all data are used."""
+    """Return the states of all filters after one row, and their outputs; all data are used.
+
+    `fixed`: (filters, states before the first row or None), of which the filters are used here. `row`: number of the
+    step, inputs, measurements, and what arrived of reports.
+    """
+    filters, _ = fixed
     k, u, z, arrivals = row
-    return fixed[0].step(states, z, u, k, arrivals)
+    return filters.step(states, z, u, k, arrivals)
 
 
 def _step_judged(fixed: tuple[AllFilters, PyTree], states: PyTree, row: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:
-    """Return the states of all filters after one row, and their outputs; what is implausible is left out."""
+    """Return the states of all filters after one row, and their outputs; what is implausible is left out.
+
+    `fixed` and `row`: as of `_step_unjudged`.
+    """
+    filters, _ = fixed
     k, u, z, arrivals = row
-    return step_plausibly(fixed[0], states, z, u, k, arrivals)
+    return step_plausibly(filters, states, z, u, k, arrivals)
 
 
 class NetworkRecursion(Recursion):
@@ -285,7 +294,9 @@ def find_central_states_before_rows(task: FilteringTask, z: tuple[np.ndarray, ..
     """
     rows = task.number_rows(), task.u, z, task.arrivals
     fixed = task.filters, None if task.begin is None else task.begin.states
-    return scan_rows(_begin, _step_central, fixed, rows, lambda: _central_states_by_xla(fixed, rows))[1]
+    # Native code, or XLA where that refuses.
+    _, central_states = scan_rows(_begin, _step_central, fixed, rows, lambda: _central_states_by_xla(fixed, rows))
+    return central_states
 
 
 def _step_central(fixed: tuple[AllFilters, PyTree], states: PyTree, row: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:

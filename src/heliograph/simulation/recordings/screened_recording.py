@@ -86,7 +86,10 @@ def screen_recording(
 
 
 def leave_out_values(node: Node | ReceivingNode, z: Float[np.ndarray, "rows received"]) -> np.ndarray:
-    """Return rows of a node of which no value counts: NaN, but what a sender's rule tells of losses."""
+    """Return rows of a node of which no value counts: NaN in place of values, so that they are missing.
+
+    A sender with a trigger also tells, beside its values, of messages that were lost: that side information stays.
+    """
     trigger = node.trigger if isinstance(node, Node) else None
     if trigger is None:
         return np.full_like(z, np.nan)

@@ -108,17 +108,22 @@ def _turn_angles_to_truth(
     def wrap(estimate: Estimate, angles: Angles) -> Estimate:
         """Return an estimate (time, ..., n) with its angles within half a turn of those of the truth (time, n)."""
         mean = jnp.asarray(estimate.mean)
+        # Axes of length 1 in the places of the mean's axes between time and state, such as filters and nodes.
         truth_at_each = truth.reshape(len(truth), *[1] * (mean.ndim - 2), -1)
         return replace(estimate, mean=wrap_near(mean, truth_at_each, angles))
 
-    # All stacks that have angles have the plant's.
+    # The plant's angles are those of any stack that has some.
     of_plant = next((angles for angles in angles_of_stacks if angles), ())
     estimates = tuple(wrap(e, angles) for e, angles in zip(smoothed["estimates"], angles_of_stacks, strict=True))
     return {"estimates": estimates, "fused": {name: wrap(e, of_plant) for name, e in smoothed["fused"].items()}}
 
 
 def _fuse_at_each_time(fusion: StackedFusions, estimates: Sequence[Estimate]) -> dict[str, Estimate]:
-    """Return the fused estimates (time, ...) by name, from nodes' estimates (time, filter, node, ...) by stack."""
+    """Return the fused estimates (time, ...) by name, from nodes' estimates (time, filter, node, ...) by stack.
+
+    A stack has filters of one structure. The rule of fusion has no state: smoothed estimates of one time are fused as
+    filtered ones are, without quantizers.
+    """
 
     def fuse(estimates: Sequence[Estimate]) -> dict[str, Estimate]:
         """Return the fused estimates of one time, by name, from nodes' estimates (filter, node, ...) by stack."""
@@ -330,27 +335,40 @@ def finish_result(
 
     Args:
         reducer: makes a result, such as error statistics, from sums over the runs.
-        recorded: sums by batch of runs; sums of numbers that all runs share (common), once; runs in each batch
-            (count); and arrays that were collected.
+        recorded: what it summed and collected over all runs, as `reduce_run` says. With smoothing each of it is a pair,
+            of filtered and of smoothed estimates; the sums have a third entry, the normalised innovations squared
+            (NIS).
         network: the network.
         smoothing: its smoothed part; None where nothing was smoothed.
     """
-    sums, common, count, collected = recorded
+    sums, common, runs_by_batch, collected = recorded
     if smoothing is None:
-        return reducer.finish(reducer.summed(sums, common, count), collected, network)
-    # With smoothing there are three sums: of filtered estimates, of smoothed ones, and of the normalised innovations
-    # squared (NIS).
-    _, _, nis_sums_by_batch = sums.sums
-    _, _, is_common = common.sums
-    # Summed over all runs: what all runs share counts once for each.
+        return reducer.finish(reducer.summed(sums, common, runs_by_batch), collected, network)
+    filtered_sums, smoothed_sums, nis_by_batch = sums.sums  # (..., batch), or a value (...) that all runs share
+    filtered_is_common, smoothed_is_common, nis_is_common = common.sums  # whether all runs share it
+    # The NIS summed over all runs: a value that all runs share counts once for each.
+    runs = runs_by_batch.sum()
     nis = jax.tree.map(
-        lambda leaf, is_same: leaf * count.sum() if is_same else leaf.sum(axis=-1), nis_sums_by_batch, is_common
+        lambda leaf, is_common: leaf * runs if is_common else leaf.sum(axis=-1), nis_by_batch, nis_is_common
     )
     _warn_of_inconsistency(smoothing.network, nis)
-    # Filtered (0), then smoothed (1).
-    results = []
-    for i, part in enumerate((network, smoothing.network)):
-        sums_of_part, common_of_part = (OfStep(sums=x.sums[i], ever=x.ever[i]) for x in (sums, common))
-        results.append(reducer.finish(reducer.summed(sums_of_part, common_of_part, count), collected[i], part))
-    filtered, smoothed = results
+
+    def finish(part: Network, sums: OfStep, common: OfStep, collected: PyTree) -> Result:
+        """Return the result of a network's filtered or smoothed estimates."""
+        return reducer.finish(reducer.summed(sums, common, runs_by_batch), collected, part)
+
+    filtered_ever, smoothed_ever = sums.ever
+    filtered_ever_is_common, smoothed_ever_is_common = common.ever
+    filtered = finish(
+        network,
+        OfStep(filtered_sums, filtered_ever),
+        OfStep(filtered_is_common, filtered_ever_is_common),
+        collected[0],
+    )
+    smoothed = finish(
+        smoothing.network,
+        OfStep(smoothed_sums, smoothed_ever),
+        OfStep(smoothed_is_common, smoothed_ever_is_common),
+        collected[1],
+    )
     return reducer.others(filtered, smoothed, smoothing.claims)

@@ -208,6 +208,7 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], SavableResults):
         lines = [] if self.smoothed is None else [f"smoothed {line}" for line in self.smoothed.failures()]
         for node, filters in self.items():
             lines += [f"{node}/{name}: {score.failure}" for name, score in filters.items() if score.failed_runs]
+            # Quantizers through which a fusion received its nodes' estimates.
             for name, score in filters.items():
                 shares = score.uplink.saturated_share() if score.uplink else {}
                 for sender, share in shares.items():
@@ -219,7 +220,11 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], SavableResults):
 
 
 def _list_figures(score: "ErrorStatistics", states: Sequence[str]) -> Mapping[str, object]:
-    """Return a filter's figures by name: RMSE, NEES with its interval, and RMSE and claim of each state."""
+    """Return a filter's figures by name: RMSE, NEES with its interval, and RMSE and claim of each state.
+
+    They make a row of a table. NEES is e' B^-1 e / n for an error e of n states and the claimed covariance B: 1 on
+    average if the claim is exact.
+    """
     nees, low, high = score.nees_per_dimension()
     rmse, error = score.rmse()
     # All states together.

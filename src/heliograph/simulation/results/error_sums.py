@@ -69,7 +69,8 @@ class Statistics(AbstractReducer[StatisticsByName]):
         covariance is the same in all runs, it need be held only once, and that may differ between stacks.
         """
         truth = jnp.asarray(step["truth"])
-        estimates = [*step["estimates"], *(step["fused"][name] for name in sorted(step["fused"]))]
+        fused = [step["fused"][name] for name in sorted(step["fused"])]
+        estimates = [*step["estimates"], *fused]
         n = len(truth)
         means = [jnp.asarray(estimate.mean).reshape(-1, n) for estimate in estimates]
         claimed = [jnp.asarray(estimate.covariance).reshape(-1, n, n) for estimate in estimates]
@@ -141,6 +142,9 @@ class Statistics(AbstractReducer[StatisticsByName]):
     def finish(self, carry: RunSums, collected: PyTree, network: Network) -> StatisticsByName:
         """Return the statistics by node and filter, from the sums over all runs.
 
+        Filters of one structure are stacked, at the nodes of a group; fusions between neighbours (meshes) have stacks
+        of their own. In the sums all their estimates lie along one axis, which is cut here.
+
         Args:
             carry: the sums over runs, of products of errors, of NEES and of claimed covariances, with all estimates
                 along one axis.
@@ -173,8 +177,10 @@ class Statistics(AbstractReducer[StatisticsByName]):
 
     def joined(self, results: Sequence[StatisticsByName], network: Network) -> StatisticsByName:
         """Return the statistics of all nodes, in the network's order, from those of parts of a network."""
-        collected = {name: filters for statistics in results for name, filters in statistics.items()}
-        return StatisticsByName({name: collected[name] for name in network.names}, network.states)
+        by_node: dict[str, dict[str, ErrorStatistics]] = {}
+        for statistics_of_part in results:
+            by_node |= statistics_of_part
+        return StatisticsByName({name: by_node[name] for name in network.names}, network.states)
 
     def others(
         self, filtered: StatisticsByName, smoothed: StatisticsByName, claims: Mapping[str, Mapping[str, Claim]]
@@ -216,6 +222,8 @@ def _make_statistics(count: np.ndarray, sums: _FilterSums, claim: Claim) -> Erro
     """Return the statistics of one filter from its sums over runs.
 
     `count`: number of runs in each batch.
+
+    `sums`: of this filter alone. `claim`: what its covariance is said to be; with "none" it has none.
     """
     # Row 0 counts failures of the test of means, the only test if no covariance is claimed.
     tests = 0 if claim == "none" else slice(None)

@@ -131,16 +131,22 @@ class FilterLabels:
 
     @property
     def filters(self) -> list[str]:
-        """Names of all filters."""
-        return list(dict.fromkeys(name for by_filter in self.by_node.values() for name in by_filter))
+        """Names of all filters, each once: the labels of the axis of filters."""
+        names = [name for by_filter in self.by_node.values() for name in by_filter]
+        return list(dict.fromkeys(names))
 
     @property
     def senders(self) -> list[str]:
-        """Names of all nodes that send through a quantizer."""
-        return list(dict.fromkeys(node for uplink in self.uplinks.values() for node in uplink.nodes))
+        """Names of all nodes that send through a quantizer, each once: the labels of the axis of senders."""
+        names = [node for uplink in self.uplinks.values() for node in uplink.nodes]
+        return list(dict.fromkeys(names))
 
     def list_placed(self, read: Callable[[Any], T]) -> list[Placed[T]]:
-        """Return (place, read(result)) for each result; a place is (number of node, number of filter)."""
+        """Return (place, read(result)) for each result by node and filter.
+
+        A place is (number of the node, number of the filter's name): the indices of the result along the axes node and
+        filter of a dataset.
+        """
         filters = self.filters
         placed: list[Placed[T]] = []
         for node, by_filter in self.by_node.items():
@@ -185,8 +191,9 @@ class FilterLabels:
 
         It has for each state its place among the numbers of all rotation vectors, or -1 for other states.
         """
+        # States that are rotation vectors: of the first filter that has any, since all that have some have the same.
         placed = self.list_placed(lambda result: result.attitude)
-        rotations = next((states for _, states in placed if states), ())  # all filters with attitudes have the same
+        rotations = next((states for _, states in placed if states), ())
         order = np.full(len(self.states), -1, dtype=np.int64)
         order[list(rotations)] = np.arange(len(rotations))
         return {"attitude": order} if rotations else {}
@@ -276,7 +283,10 @@ def iterate_filters(
 
 
 def read_estimate(dataset: "xr.Dataset", claim: Claim, values: Mapping[str, np.ndarray]) -> Estimate:
-    """Return the estimate of a filter of a dataset, from its {field: values} as `iterate_filters` yields them."""
+    """Return the estimate of a filter of a dataset, from its {field: values} as `iterate_filters` yields them.
+
+    `claim`: what its covariance is said to be, such as "exact".
+    """
     # For each state, its place among the numbers of all rotation vectors of attitudes, or -1 for other states.
     order = read_values(dataset, "attitude", []) if "attitude" in dataset else np.zeros(0, dtype=np.int64)
     attitude = tuple(int(i) for i in np.argsort(order, kind="stable") if order[i] >= 0)

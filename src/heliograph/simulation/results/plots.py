@@ -24,20 +24,24 @@ def choose_filters(
 
     The default is the first node with filters, and all of its filters.
     """
-    with_filters = [name for name, by_filter in filters_by_node.items() if by_filter]
-    if not with_filters or node not in (None, *with_filters):
-        raise fail("node", f"one with filters: {', '.join(with_filters) or 'there is none'}", repr(node))
-    chosen_node = with_filters[0] if node is None else node
-    names = list(filters_by_node[chosen_node]) if filters is None else list(filters)
-    unknown = [name for name in names if name not in filters_by_node[chosen_node]]
+    nodes = [name for name, by_filter in filters_by_node.items() if by_filter]  # those with filters
+    if not nodes or node not in (None, *nodes):
+        raise fail("node", f"one with filters: {', '.join(nodes) or 'there is none'}", repr(node))
+    chosen_node = nodes[0] if node is None else node
+    available = filters_by_node[chosen_node]
+    names = list(available) if filters is None else list(filters)
+    unknown = [name for name in names if name not in available]
     if unknown or not names:
-        expected = f"some of {', '.join(filters_by_node[chosen_node])}"
+        expected = f"some of {', '.join(available)}"
         raise fail(f"filters of {chosen_node}", expected, repr(unknown[0]) if unknown else "none")
     return chosen_node, names
 
 
 def find_state_indices(states: Sequence[str] | None, known: Sequence[str]) -> list[int]:
-    """Return the indices of the chosen `states` in `known`, or of all if None; an unknown one is a ValueError."""
+    """Return the indices of the chosen `states` in `known`, or of all if None; an unknown one is a ValueError.
+
+    `states`: one name, or several.
+    """
     one_or_all = [states] if isinstance(states, str) else states
     chosen = list(known if one_or_all is None else one_or_all)
     for name in chosen:

@@ -125,8 +125,10 @@ class Record(SavableResults):
     def runs(self) -> int | None:
         """Number of Monte Carlo runs, the first of three axes of all arrays; None for a recording, with two axes."""
         means = [np.asarray(estimate.mean) for filters in self.estimates.values() for estimate in filters.values()]
-        arrays = [*means, *self.measurements.values(), *([] if self.truth is None else [self.truth])]
-        return len(arrays[0]) if arrays and arrays[0].ndim == 3 else None
+        truth = [] if self.truth is None else [self.truth]
+        arrays = [*means, *self.measurements.values(), *truth]  # (run, time, n), or (time, n) without runs
+        has_runs = bool(arrays) and arrays[0].ndim == 3
+        return len(arrays[0]) if has_runs else None
 
     def of_run(self, run: int) -> "Record":
         """Return the record of one of the runs, without an axis of runs.
@@ -369,7 +371,6 @@ class Record(SavableResults):
         The line names the node, the filter, the first step, and in how many runs; nothing is repaired. One line more
         for each uplink that saturated. Smoothed estimates likewise, after "smoothed".
         """
-        # Smoothed estimates first.
         lines = [] if self.smoothed is None else [f"smoothed {line}" for line in self.smoothed.failures()]
         for node, filters in self.estimates.items():
             for name, estimate in filters.items():
@@ -378,7 +379,6 @@ class Record(SavableResults):
                     f"{node}/{name}: no valid {what} {when}"
                     for when in describe_bad_steps(~mask_sound_estimates(estimate))
                 ]
-        # Quantizers that saturated.
         for name, uplink in self.uplinks.items():
             for i, node in enumerate(uplink.nodes):
                 saturated = uplink.saturated[..., i, :]

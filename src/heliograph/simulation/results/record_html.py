@@ -57,14 +57,14 @@ def write_record_html(record: DrawableRecord) -> str:
     Returns:
         HTML that fetches nothing, runs nothing, and fits any width.
     """
-    # The title; of a record of Monte Carlo runs the first run is drawn (`one`).
+    # The title, and the first node with estimates.
     node = next((name for name, filters in record.estimates.items() if filters), None)
     rows, runs = len(record.time), record.runs
     title = f"{type(record).__name__}: {rows} row{'s' * (rows != 1)}"
     title += "" if runs is None else f" of {runs} runs, the first drawn"
     if node is None or rows == 0 or runs == 0:
         return f"<div>{title}, no estimates</div>"
-    one = record if runs is None else record.of_run(0)
+    one = record if runs is None else record.of_run(0)  # the first of Monte Carlo runs is drawn
     # At most FILTERS filters, POINTS rows and PANELS states are drawn, with notes on what is left out.
     filters = dict(list(one.estimates[node].items())[:FILTERS])
     chosen = np.unique(np.linspace(0, rows - 1, min(rows, POINTS)).round().astype(int))
@@ -83,7 +83,10 @@ def write_record_html(record: DrawableRecord) -> str:
 
 
 def _make_legend(filters: Mapping[str, Estimate], record: DrawableRecord) -> str:
-    """Return a line of HTML with the filters' names, colours and claims, and the truth where it is drawn."""
+    """Return a line of HTML with the filters' names, colours and claims, and the truth where it is drawn.
+
+    A claim says what a covariance is, such as "exact". The truth is a dashed line, a filter a patch of its colour.
+    """
     entries = [
         (f"background:{colour}", f"{name} ({estimate.claim})")
         for colour, (name, estimate) in zip(COLOURS, filters.items(), strict=False)
@@ -179,8 +182,10 @@ def _write_curve_path(y: np.ndarray, colour: str, attributes: str = "") -> str:
     In SVG, M moves the pen and L draws a line to a point. `attributes`: further attributes of the path.
     """
     x = _compute_x_places(len(y))
-    pieces = ["L".join(f"{x[k]:.1f} {y[k]:.2f}" for k in piece) for piece in _split_at_gaps(np.isfinite(y))]
-    path = "".join(f"M{points}" for points in pieces)
+    path = ""
+    for piece in _split_at_gaps(np.isfinite(y)):
+        points = [f"{x[k]:.1f} {y[k]:.2f}" for k in piece]
+        path += "M" + "L".join(points)
     return (
         f'<path d="{path}" fill="none" stroke="{colour}" stroke-width="1.5" vector-effect="non-scaling-stroke"'
         f' stroke-linecap="round"{attributes}/>'

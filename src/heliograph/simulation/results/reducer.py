@@ -135,7 +135,10 @@ class Trajectories(AbstractReducer[Record]):
         return trajectories_record(network, collected, time)
 
     def joined(self, results: Sequence[Record], network: Network) -> Record:
-        """Return one record of all nodes, in the network's order, from records of parts of the network."""
+        """Return one record of all nodes, in the network's order, from records of parts of the network.
+
+        The parts have the same plant and runs, so that times and true states are those of the first part.
+        """
         measurements = {name: z for record in results for name, z in record.measurements.items()}
         estimates = {name: filters for record in results for name, filters in record.estimates.items()}
         return replace(

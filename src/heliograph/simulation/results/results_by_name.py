@@ -72,9 +72,9 @@ def split_measurements(
 
 
 def transmissions_by_name(network: Network, groups: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return for each node why its sender transmitted.
+    """Return for each node why its sender transmitted at each step: codes of `SendReason`, (..., m).
 
-    `groups`: arrays (..., node, m) by the number of the nodes' group.
+    `groups`: arrays (..., node, m) by the number of the nodes' group (nodes of one structure), as text.
     """
     return {
         name: np.asarray(node_group)[..., i, :]
@@ -104,18 +104,21 @@ def collect_mode_probabilities(network: Network, batch: PyTree) -> dict[tuple[st
 def collect_weighted_innovations(network: Network, batch: PyTree) -> dict[str, dict[str, Weighed]]:
     """Return innovations with the weight that each component got, by node and filter, of filters that weigh components.
 
-    `batch["weighed"]` has them by stack (time, filter, node, m), with None for
-    stacks that do not weigh. Those of central filters are under "weighed_centrally" by name, and under FUSED in the
-    result.
+    `batch["weighed"]` has them by stack of filters (time, filter, node, m), with None for stacks that do not weigh; it
+    is missing in simulations. Those of filters of all measurements are under "weighed_centrally" by name, and under
+    FUSED in the result.
     """
     weighed_by_stack = batch.get("weighed", ())
     weighed: dict[str, dict[str, Weighed]] = {}
     for (node, name), index in network.estimate_indices.items() if weighed_by_stack else ():
-        if weighed_by_stack[index.stack] is not None:
-            fields = [np.asarray(field)[:, index.filter, index.node] for field in weighed_by_stack[index.stack]]
+        of_stack = weighed_by_stack[index.stack]
+        if of_stack is not None:
+            fields = [np.asarray(field)[:, index.filter, index.node] for field in of_stack]
             weighed.setdefault(node, {})[name] = Weighed(*fields)
     central = {name: values for name, values in batch.get("weighed_centrally", {}).items() if values is not None}
-    return weighed | ({FUSED: central} if central else {})
+    if central:
+        weighed[FUSED] = central
+    return weighed
 
 
 def split_by_name(

@@ -155,7 +155,10 @@ def _list_names(dataset: "xr.Dataset") -> list[tuple[object, "xr.DataArray"]]:
 
 
 def _map_names(change: Callable[[str], str], names: "xr.DataArray") -> np.ndarray:
-    """Return the names with each changed by `change`, as strings of fixed length for files, else as Python's."""
+    """Return the names with each changed by `change`: for a file (`quote_for_file`) as strings of one fixed length.
+
+    Names read from a file are made strings of Python again.
+    """
     changed_names = [change(str(name)) for name in names.values]
     if change is quote_for_file:
         return np.array(changed_names, dtype="U")

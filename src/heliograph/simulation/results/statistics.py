@@ -54,7 +54,7 @@ class ErrorStatistics:
         return f"no valid {moment} from step {step} in {self.failed_runs} of {self.runs} runs"
 
     def _warn_of_failures(self) -> None:
-        """Warn, at the caller of a public method, that figures are NaN since some run had no valid estimate."""
+        """Warn, at the caller of a public method, that figures are NaN where some run had no valid estimate."""
         if self.failed_runs:
             warnings.warn(self.failure, stacklevel=3)
 
@@ -100,15 +100,22 @@ class ErrorStatistics:
         return _root_mean(squared, self.count)
 
     def rmse_by_state(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the root mean squared error of each state over runs and steps, and its standard error: (n,), (n,)."""
+        """Return the root mean squared error of each state over runs and steps, and its standard error: (n,), (n,).
+
+        The standard error comes from the scatter between batches of runs.
+        """
         self._warn_of_failures()
         # `outer`: e e' summed over the runs of each batch, (batch, time, n, n).
         squared = np.diagonal(self.outer, axis1=-2, axis2=-1).mean(axis=1)
-        roots_and_errors = [_root_mean(squared[:, i], self.count) for i in range(squared.shape[1])]
-        return np.array([root for root, _ in roots_and_errors]), np.array([error for _, error in roots_and_errors])
+        roots, errors = [], []
+        for squared_of_state in squared.T:
+            root, error = _root_mean(squared_of_state, self.count)
+            roots.append(root)
+            errors.append(error)
+        return np.array(roots), np.array(errors)
 
     def deviation_by_state(self) -> np.ndarray:
-        """Return the root of the mean over runs and steps of each state's claimed variance, (n,)."""
+        """Return the root of the mean, over runs and steps, of the variance claimed of each state, (n,)."""
         self._warn_of_failures()
         variance = np.diagonal(self.claimed(), axis1=-2, axis2=-1).mean(axis=0)
         return np.sqrt(np.where(variance >= 0, variance, np.nan))  # NaN of what is no variance
@@ -203,8 +210,8 @@ def expand_pairs(pairs: np.ndarray) -> np.ndarray:
 def pool(statistics: Sequence[ErrorStatistics]) -> ErrorStatistics:
     """Pool the statistics of several nodes, their steps joined: means run over nodes as over steps.
 
-    Means and rates then have standard errors over runs: runs stay the unit of independence, so that errors that nodes
-    share are not counted as independent ones.
+    So nodes are averaged like steps, and not like runs: errors that nodes share do not count as independent, and
+    standard errors come from the scatter between runs alone.
 
     Args:
         statistics: one for each node, of the same runs: sums by batch of runs and step (batch, steps, ...) of error
@@ -216,17 +223,20 @@ def pool(statistics: Sequence[ErrorStatistics]) -> ErrorStatistics:
     nodes = items("pooled statistics", statistics, "ErrorStatistics")
     for of_node in nodes:
         instance("pooled statistics", of_node, ErrorStatistics, "ErrorStatistics")
-    # Statistics of the same runs have equal counts of runs in each batch. Join the steps; the weakest claim holds.
+    # Statistics of the same runs have equal counts of runs in each batch.
     if not nodes or any(not np.array_equal(s.count, nodes[0].count) for s in nodes):
         raise fail("pooled statistics", "statistics of the same runs", f"{len(nodes)} that differ")
+    # Runs that failed at each step of each node; where none were counted, none failed.
+    failed = [np.zeros(s.nees.shape[1]) if s.failed is None else s.failed for s in nodes]
+    steps = 1  # the axis of steps in sums (batch, steps, ...)
     return ErrorStatistics(
         count=nodes[0].count,
-        pairs=np.concatenate([s.pairs for s in nodes], axis=1),
-        claimed_pairs=np.concatenate([s.claimed_pairs for s in nodes], axis=1),
-        nees=np.concatenate([s.nees for s in nodes], axis=1),
-        claim=weakest([s.claim for s in nodes]),
-        failed=np.concatenate([np.zeros(s.nees.shape[1]) if s.failed is None else s.failed for s in nodes]),
-        failed_runs=max(s.failed_runs for s in nodes),
+        pairs=np.concatenate([s.pairs for s in nodes], axis=steps),
+        claimed_pairs=np.concatenate([s.claimed_pairs for s in nodes], axis=steps),
+        nees=np.concatenate([s.nees for s in nodes], axis=steps),
+        claim=weakest([s.claim for s in nodes]),  # what holds of all: "exact" is stronger than "upper", "nominal"
+        failed=np.concatenate(failed),
+        failed_runs=max(s.failed_runs for s in nodes),  # runs that failed at some step, of the worst node
     )
 
 
@@ -249,7 +259,7 @@ class WorstDirection:
 
     @property
     def z(self) -> float:
-        """Excess of the ratio over 1 in standard errors."""
+        """Excess of the ratio, of the actual variance to the claimed one, over 1 in standard errors; 0 without any."""
         return (self.ratio - 1) / self.standard_error if self.standard_error else 0.0
 
 

@@ -196,7 +196,11 @@ def score_innovations(
 
 
 def _score_row(filter: AbstractFilter, state: PyTree, innovation: Innovation, k: Array) -> tuple[jax.Array, jax.Array]:
-    """Return one row's log-likelihood and its whitened innovation (m,), NaN for components that are not used."""
+    """Return one row's log-likelihood and its whitened innovation (m,), NaN for components that are not used.
+
+    `innovation`: value e, its claimed covariance S and, of a filter that gives unlikely components a smaller weight,
+    these weights. Whitened is L^-1 e with L L' = S. The row's state and number are not used.
+    """
     is_used = ~jnp.isnan(innovation.value)
     if innovation.weight is not None:  # do not judge a filter by what it mostly left out
         is_used &= innovation.weight >= HALF

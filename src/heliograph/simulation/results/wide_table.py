@@ -76,7 +76,7 @@ def read_frame(frame: "pd.DataFrame") -> dict[str, Any]:
         indices.setdefault((node, name, quantity), []).append(i)
     _sort_indices(frame, indices)
     values = {key: frame.iloc[:, columns].to_numpy().reshape(*leading_axes, -1) for key, columns in indices.items()}
-    # States as the truth, else the first mean, has them.
+    # Names of the states: the components of the truth, else of the first mean.
     named = next((columns for (_, _, quantity), columns in indices.items() if quantity in ("truth", "mean")), [])
     measurements = {node: z for (node, _, quantity), z in values.items() if quantity == "measurement"}
     estimates: dict[str, dict[str, Estimate]] = {node: {} for node in measurements}
@@ -95,42 +95,45 @@ def read_frame(frame: "pd.DataFrame") -> dict[str, Any]:
 
 def _check_rows_of_runs(frame: "pd.DataFrame", runs: int, steps: int) -> None:
     """Raise ValueError unless the rows of each run follow one another, and every run has the same times in order."""
-    run, time = (np.asarray(frame.index.get_level_values(level)) for level in ("run", "time"))
-    whole = len(frame) == runs * steps
-    if whole:
-        of_first_step, of_first_run = run.reshape(runs, steps)[:, :1], time.reshape(runs, steps)[:1]
-        whole = bool(
-            (run.reshape(runs, steps) == of_first_step).all() and (time.reshape(runs, steps) == of_first_run).all()
-        )
-    if not whole:
+    is_whole = len(frame) == runs * steps
+    if is_whole:
+        # One row for each run: its number must be the same at all steps, and its times those of the first run.
+        run = np.asarray(frame.index.get_level_values("run")).reshape(runs, steps)
+        time = np.asarray(frame.index.get_level_values("time")).reshape(runs, steps)
+        is_whole = bool((run == run[:, :1]).all() and (time == time[:1]).all())
+    if not is_whole:
         expected = "the same times of each run, one run after another (sort_index)"
         raise fail("table, rows", expected, f"{len(frame)} of {runs} runs, some in another order or missing")
 
 
 def _sort_indices(frame: "pd.DataFrame", indices: _Places) -> None:
-    """Put the columns of each quantity into one order, by what they say of themselves: states as the first of them has.
+    """Put the columns of each quantity into the order of the states, which is that of the first truth or mean.
 
-    `indices`: of each key, the indices of its columns, which are changed. Components that are no states are numbered.
+    A table may have been sorted by its labels. Components that are no states are numbered, "z0" or "0": by number.
+
+    Args:
+        frame: the table, whose columns are labelled as in LEVELS.
+        indices: of each key (node, filter, quantity), the indices of its columns; each list is sorted in place.
 
     Raises:
         ValueError: a quantity without some of the states.
     """
-    labels = [(str(column[3]), str(column[4])) for column in frame.columns]  # component and other
-    states = next(
-        ([labels[i][0] for i in found] for (*_, kind), found in indices.items() if kind in ("truth", "mean")), []
-    )
+    # Of each column the component, and of a covariance E[e_i e_j] the other state j.
+    components = [str(column[LEVELS.index("component")]) for column in frame.columns]
+    others = [str(column[LEVELS.index("other")]) for column in frame.columns]
+    columns_of_states = next((found for (*_, kind), found in indices.items() if kind in ("truth", "mean")), [])
+    states = [components[i] for i in columns_of_states]
     for (node, name, quantity), found in indices.items():
-        if quantity == "measurement" or quantity == MODES:
-            found.sort(key=lambda i: int(labels[i][0].removeprefix("z")))
+        if quantity in ("measurement", MODES):
+            found.sort(key=lambda i: int(components[i].removeprefix("z")))
             continue
-        others = states if quantity in COVARIANCE else [""]
-        there = {(labels[i][0], labels[i][1] if quantity in COVARIANCE else ""): i for i in found}
-        wanted = [(state, other) for state in states for other in others]
-        if len(found) != len(wanted) or not set(wanted) <= there.keys():
-            raise fail(
-                f"table, {quantity} of {node}/{name}", f"a column for each of {', '.join(states)}", sorted(there)
-            )
-        found[:] = [there[label] for label in wanted]
+        is_covariance = quantity in COVARIANCE
+        column_of_label = {(components[i], others[i] if is_covariance else ""): i for i in found}
+        labels = [(state, other) for state in states for other in (states if is_covariance else [""])]
+        if len(found) != len(labels) or not set(labels) <= column_of_label.keys():
+            expected = f"a column for each of {', '.join(states)}"
+            raise fail(f"table, {quantity} of {node}/{name}", expected, sorted(column_of_label))
+        found[:] = [column_of_label[label] for label in labels]
 
 
 def _read_estimate(frame: "pd.DataFrame", indices: _Places, values: Mapping[_Key, np.ndarray], key: _Key) -> Estimate:
@@ -177,8 +180,9 @@ def _keep_labels(columns: Sequence[Column]) -> Any:
     """
     import pandas as pd
 
-    levels = [list(dict.fromkeys(column[i] for column in columns)) for i in range(len(LEVELS))]
-    codes = [[level.index(column[i]) for column in columns] for i, level in enumerate(levels)]
+    # pandas stores for each part of a label its distinct values (level), and which of them each column has (codes).
+    levels = [list(dict.fromkeys(column[part] for column in columns)) for part in range(len(LEVELS))]
+    codes = [[level.index(column[part]) for column in columns] for part, level in enumerate(levels)]
     return pd.MultiIndex([pd.Index(level, dtype=object) for level in levels], codes, names=LEVELS)
 
 

@@ -43,7 +43,7 @@ def blame_nodes_for_implausible_rows(
     without = {name: values[rows] for name, values in z.items()}
     for i, removal in enumerate(removals):
         without[removal.node][i] = np.nan
-    # Whether the filters find the row plausible without the node.
+    # Whether the filters find the row plausible without the node: `votes` (removal, filter, field of a Judgement).
     votes = _judge_rows(filters, before, np.concatenate(list(without.values()), axis=1), u, rows)
     plausible = {removal: Judgement.why_values(vote) is None for removal, vote in zip(removals, votes, strict=True)}
 
@@ -71,7 +71,7 @@ def _judge_rows(
 ) -> Float[np.ndarray, "row filter 4"]:
     """Return each filter's judgement whether the measurements of these rows are plausible, from its states before.
 
-    The last axis holds the fields of a Judgement. Native code computes it, or XLA if there is none.
+    The last axis holds the four fields of a `Judgement`. Native code computes it, or XLA if there is none.
 
     Args:
         filters: the filters by name.

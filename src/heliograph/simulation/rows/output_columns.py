@@ -114,18 +114,23 @@ def _collect_weights(network: Network, outcome: PyTree) -> dict[tuple[str, str],
     `outcome`: the outputs of a step as a tree that has the number of its column in place of each value. It is stacked
     by stack of filters and then (filter, node), with None for stacks that do not weigh.
     """
-    columns_of_nodes = {
-        name: [np.asarray(field)[index.filter, index.node] for field in outcome["weighed"][index.stack]]
-        for name, index in network.estimate_indices.items()
-        if outcome["weighed"][index.stack] is not None
-    }
-    weighed_centrally = outcome["weighed_centrally"].items()
-    columns_of_central = {(FUSED, name): list(columns) for name, columns in weighed_centrally if columns is not None}
     weights = {}
-    for name, columns in (columns_of_nodes | columns_of_central).items():
-        value, variance, weight = (tuple(map(int, field)) for field in columns)
-        weights[name] = WeighingColumns(value, variance, weight)
+    for name, index in network.estimate_indices.items():
+        of_stack = outcome["weighed"][index.stack]
+        if of_stack is not None:
+            value, variance, weight = (np.asarray(field)[index.filter, index.node] for field in of_stack)
+            weights[name] = _make_weighing_columns(value, variance, weight)
+    for central_name, columns in outcome["weighed_centrally"].items():
+        if columns is not None:
+            weights[FUSED, central_name] = _make_weighing_columns(*columns)
     return weights
+
+
+def _make_weighing_columns(value: np.ndarray, variance: np.ndarray, weight: np.ndarray) -> WeighingColumns:
+    """Return the columns of each component's innovation, its variance and its weight, as whole numbers."""
+    return WeighingColumns(
+        value=tuple(map(int, value)), variance=tuple(map(int, variance)), weight=tuple(map(int, weight))
+    )
 
 
 def _collect_judgements(network: Network, outcome: PyTree) -> dict[str, dict[str, JudgementColumns]]:
@@ -135,18 +140,28 @@ def _collect_judgements(network: Network, outcome: PyTree) -> dict[str, dict[str
     FUSED.
     """
     judged = {"estimates": outcome["judged"], "fused": {}}
-    # Split each field of the judgements, whose last two axes are (filter, node).
+    # Each field of the judgements, distance, arrived, reason and input, by node and filter. A stack of filters has
+    # fields (..., filter, node).
     fields = range(len(JudgementColumns._fields))
-    columns_by_field = [split_by_name(network, judged, partial(_read_field, i), axis=-2) for i in fields]
-    by_node = {
-        node: {name: JudgementColumns(*(int(field[node][name]) for field in columns_by_field)) for name in filters}
-        for node, filters in columns_by_field[0].items()
-    }
+    distance, arrived, reason, input = (
+        split_by_name(network, judged, partial(_read_field, i), axis=-2) for i in fields
+    )
+    by_node: dict[str, dict[str, JudgementColumns]] = {}
+    for node, filters in distance.items():
+        by_node[node] = {
+            name: JudgementColumns(
+                distance=int(distance[node][name]),
+                arrived=int(arrived[node][name]),
+                reason=int(reason[node][name]),
+                input=int(input[node][name]),
+            )
+            for name in filters
+        }
     central = outcome["judged_centrally"]
     fused = {name: JudgementColumns(*map(int, columns)) for name, columns in central.items()}
     return by_node | {FUSED: fused}
 
 
 def _read_field(i: int, judged: PyTree) -> np.ndarray:
-    """Return field i of a judgement."""
+    """Return field i of a judgement: 0 distance, 1 arrived, 2 reason, 3 input."""
     return np.asarray(judged[i])

@@ -46,7 +46,10 @@ class RowHistory(NamedTuple):
         return jax.tree.map(lambda leaf: leaf[row], self.state)
 
     def inputs_into_row(self, row: jax.Array, dt: int) -> jax.Array:
-        """Return the inputs that led to a row: those held at the previous row, and the time since it at place `dt`."""
+        """Return the inputs that led to a row, for a plant whose input number `dt` is the length of a step.
+
+        They are the inputs held since the previous row, and in their midst the time that has passed since then.
+        """
         held_inputs = self.held[row - 1]
         _, _, time = self.read_row(row)
         _, _, time_before = self.read_row(row - 1)

@@ -74,8 +74,9 @@ class BackwardSweep(Module):
     def states_after(self, history: RowHistory, row: jax.Array) -> PyTree:
         """Return the states after a row of the filters that can be smoothed, in the form in which a step takes them.
 
-        That is a tuple of six: states of the nodes' filters by stack, and of central ones by name; the states of
-        quantizers, centres, fusions by message, and fused estimates under test are empty, since nothing is fused here.
+        That is a tuple of six: states of the nodes' filters by stack (filters of one structure), and of central ones by
+        name; the states of quantizers, centres, fusions by message, and fused estimates under test are empty, since
+        nothing is fused here.
         """
         by_stack, central, *_ = history.state_after(row)
         central_states = {name: central[name] for name in self.network_step.filters.central}
@@ -105,6 +106,9 @@ def _map_filters(function: Callable[..., object], steps: NetworkSmootherStep, *r
 
     Results of a stack have leading axes (filter, node). `rest`: further arguments of the function, each a pair like
     `steps`.
+
+    A stack has filters that differ in numbers alone. A smoother step is what the backward pass needs of a filter's
+    step.
     """
     steps_by_stack, central_steps = steps
     function_of_stack = jax.vmap(jax.vmap(function))  # over filters and nodes
@@ -138,7 +142,10 @@ def make_backward_sweep(static: Static, dt: int | None) -> tuple[Callable[..., P
     find_earlier = _find_earlier_step if dt is None else _find_earlier_row
 
     def run(numbers: list[jax.Array], history: RowHistory, span: jax.Array) -> PyTree:
-        """Smooth rows `begin` to `stop` from the last one back; return the estimates after the first."""
+        """Smooth rows from the last one back; return the estimates after the first. `span`: (begin, stop).
+
+        `numbers`: the arrays of the `BackwardSweep`. `history`: the rows, with the states after each.
+        """
         sweep: BackwardSweep = static.with_arrays(numbers)
         begin, stop = span
         last_row = stop - 1, history.step[stop - 1]
@@ -179,7 +186,11 @@ def _make_step_into_row(dt: int) -> StepInto:
     """
 
     def step_into_row(sweep: BackwardSweep, history: RowHistory, step_of_row: StepOfRow) -> NetworkSmootherStep:
-        """Filter one row again from the states after the row before, and return the terms of the backward pass."""
+        """Filter one row again from the states after the row before, and return the terms of the backward pass.
+
+        `step_of_row`: the row, and the number of its step, which is not needed here. The terms are, for each filter,
+        what a smoother needs of the step to go back over it.
+        """
         row, _ = step_of_row
         state = sweep.states_after(history, row - 1)
         received, _, _ = history.read_row(row)
@@ -299,18 +310,21 @@ class RowSmoother:
         """
         with jax.enable_x64(True):
             by_stack, fused = self._find_program(history)(history, np.array([begin, stop], dtype=np.int32))
-        results: dict[str, dict[str, Estimate]] = {name: {} for name in self.network.names}
-        for k, outputs in by_stack.items():
-            for f, name in enumerate(self.network.stacks[k].filters):
-                for i, node in enumerate(self.network.groups[self.network.stacks[k].group]):
-                    results[node][name] = _take_estimate(outputs, outputs.claim, (f, i))
+        network = self.network
+        # Estimates of a stack are (filter, node, ...): filters of one structure at the nodes of one group.
+        results: dict[str, dict[str, Estimate]] = {name: {} for name in network.names}
+        for number, outputs in by_stack.items():
+            stack = network.stacks[number]
+            for f, name in enumerate(stack.filters):
+                for i, node in enumerate(network.groups[stack.group]):
+                    results[node][name] = _take_estimate(outputs, outputs.claim, index=(f, i))
         # Fused ones; a rule's claim follows from those of what it fuses.
         claims = {node: {name: outputs.claim for name, outputs in filters.items()} for node, filters in results.items()}
         for name, outputs in fused.items():
-            fusion, claim = self.network.fused[name], outputs.claim
+            fusion, claim = network.fused[name], outputs.claim
             if isinstance(fusion, Fusion):
-                claim = fusion.claim([claims[node][fusion.filter] for node in self.network.nodes_with(fusion.filter)])
-            results.setdefault(Network.FUSED, {})[name] = _take_estimate(outputs, claim, ())
+                claim = fusion.claim([claims[node][fusion.filter] for node in network.nodes_with(fusion.filter)])
+            results.setdefault(Network.FUSED, {})[name] = _take_estimate(outputs, claim, index=())
         return {node: filters for node, filters in results.items() if filters}
 
 
@@ -324,8 +338,8 @@ def _take_estimate(outputs: Estimate, claim: Claim, index: tuple[int, ...]) -> E
 
     If the mean is not finite, or the matrix is no covariance (not positive semidefinite), it claims "none".
     """
+    mean, covariance = np.asarray(outputs.mean)[index], np.asarray(outputs.covariance)[index]
     modes = None if outputs.modes is None else np.asarray(outputs.modes)[index]
-    mean, covariance = (np.asarray(stacked_values)[index] for stacked_values in (outputs.mean, outputs.covariance))
     return lower_unsound_claim(Estimate(mean, covariance, claim, modes, attitude=outputs.attitude))
 
 

@@ -47,8 +47,10 @@ class NetworkStep(Module):
     def __init__(self, network: Network, filters: AllFilters):
         """Store the filters and, by group of nodes, the indices of each node's components in the joined measurement."""
         self.filters = filters
-        indices = {name: tuple(rows) for name, rows in network.rows.items()}
-        self.columns = tuple(tuple(indices[name] for name in names) for names in network.groups)
+        columns_by_group = []
+        for names in network.groups:
+            columns_by_group.append(tuple(tuple(network.rows[name]) for name in names))
+        self.columns = tuple(columns_by_group)
 
     def step(self, state: PyTree, received: jax.Array, u: jax.Array, k: jax.Array) -> tuple[PyTree, PyTree]:
         """Return all filters' states after step k, without implausible measurements, and the outputs.
@@ -87,7 +89,10 @@ class RowLayout(NamedTuple):
         return self.state.size + self.received + self.inputs + 1
 
     def split_row(self, row: jax.Array) -> tuple[PyTree, jax.Array, jax.Array, jax.Array]:
-        """Return the filters' states, measurements, inputs and step number, which stand side by side in a row."""
+        """Return the states of all filters, the measurements of all nodes, the inputs and the step number of a row.
+
+        They stand side by side in it: `self.received` measurements, `self.inputs` inputs.
+        """
         state, data_of_row = row[: self.state.size], row[self.state.size :]
         z, u = data_of_row[: self.received], data_of_row[self.received : self.received + self.inputs]
         k = data_of_row[-1].astype(np.int64)
@@ -258,7 +263,8 @@ class OneRowStep:
 def _check_reports(filters: AllFilters) -> None:
     """Raise ValueError if nodes report to a centre over random links.
 
-    A row says what a node measured, but not which report arrived.
+    A report is an estimate that a node sends to a centre. A row says what a node measured, but not which report
+    arrived: that could only be known of links without channels (`uplinks.groups` is empty).
     """
     for name, by_report in filters.reporting.items():
         if by_report.uplinks.groups:
@@ -293,7 +299,9 @@ def _make_step(layout: RowLayout) -> Any:
 def _make_row_function(layout: RowLayout) -> Any:
     """Return the function (numbers, row) -> row of states and outputs; equal layouts get the same function.
 
-    `numbers`: the arrays of a network's step. `layout`: everything else of it, and where the parts of a row stand.
+    It is `_make_step` of this layout, with its results side by side in one array, as compiled code puts them out.
+    `numbers` are the arrays of a network's step, such as its models' matrices. `layout`: everything else of the step,
+    and where states, measurements, inputs and the step's number stand in a row.
     """
 
     def step(numbers: list[jax.Array], row: jax.Array) -> jax.Array:

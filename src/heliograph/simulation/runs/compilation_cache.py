@@ -40,7 +40,10 @@ def keep_compilations(folder: str | Path | None = None) -> Path:
 
 
 def _find_default_folder() -> Path:
-    """Return the folder of compiled programs in the user's cache, in $XDG_CACHE_HOME or in ~/.cache."""
+    """Return the user's folder for compiled programs, in $XDG_CACHE_HOME or in ~/.cache.
+
+    It raises ValueError if neither is known.
+    """
     if os.environ.get("XDG_CACHE_HOME"):
         return Path(os.environ["XDG_CACHE_HOME"]) / "heliograph" / "compilations"
     try:

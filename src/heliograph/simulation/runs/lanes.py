@@ -67,8 +67,8 @@ class RunLanes:
         after another, so that no bit depends on which lanes run at once. Results are put in the order of the runs.
         """
         numbers = np.arange(start, start + blocks)
-        runs = self.first_run + BLOCK * numbers[:, None] + np.arange(BLOCK)
-        lanes = [np.flatnonzero(numbers % self.count == lane) for lane in range(self.count)]
+        runs = self.first_run + BLOCK * numbers[:, None] + np.arange(BLOCK)  # numbers of the runs (block, BLOCK)
+        lanes = [np.flatnonzero(numbers % self.count == lane) for lane in range(self.count)]  # rows of `runs`, by lane
         recorded_by_lane = self._run_on_devices(runs, lanes) if self.wide else self._run_in_threads(runs, lanes)
         blocks_by_lane = np.concatenate(lanes)
         return jax.tree.map(
@@ -84,7 +84,11 @@ class RunLanes:
         """
 
         def advance_lane(lane: int) -> PyTree:
-            """Simulate one lane's blocks: add them to the lane's sums, and return what is recorded of their runs."""
+            """Simulate one lane's blocks: add them to the lane's sums, and return what is recorded of their runs.
+
+            From outside: `runs` (block, BLOCK), the numbers of the runs in each block, and `lanes`, the blocks of each
+            lane.
+            """
             with jax.enable_x64(True):
                 carry = self.start() if self.carries[lane] is None else self.carries[lane]
                 runs_of_lane = runs[lanes[lane]]
@@ -101,6 +105,7 @@ class RunLanes:
         `runs` (block, BLOCK): numbers of the runs. `lanes`: for each lane the indices of its blocks; all lanes have
         equally many. `self.carries`: the lanes' sums so far, a list before the first call, then stacked on the devices.
         """
+        # Arrays are divided along their first axis, of lanes, among all devices.
         sharding = NamedSharding(Mesh(np.array(jax.devices()), ("lane",)), PartitionSpec("lane"))  # type: ignore[no-untyped-call]
         if isinstance(self.carries, list):
             carries = jax.tree.map(lambda leaf: np.stack([leaf] * self.count), to_numpy(self.start()))
@@ -111,7 +116,10 @@ class RunLanes:
         return [jax.tree.map(lambda leaf: leaf[lane], on_host) for lane in range(self.count)]  # noqa: B023
 
     def total(self) -> PyTree:
-        """Return the sum over all runs: the lanes' sums so far (`self.carries`), added always in the same order."""
+        """Return the sum over all runs: the lanes' sums so far (`self.carries`), added always in the same order.
+
+        A fixed order of additions makes every bit of the sum independent of how many lanes ran at once.
+        """
         if self.pool is not None:
             self.pool.shutdown()
         if isinstance(self.carries, list):

@@ -39,8 +39,8 @@ def over_runs(function: Callable[..., PyTree], *arrays: PyTree, width: int = WID
         raise fail("function over runs", "a function of one run's arrays", show_value(function))
     check_count("width", width)
     # All arrays must have the same leading axis, and none may be empty.
-    values = [_read_numbers(a) for a in arrays]
-    if not values or any(a.ndim == 0 or len(a) != len(values[0]) or not a.size for a in values):
+    values = [_read_numbers(array) for array in arrays]
+    if not values or any(value.ndim == 0 or len(value) != len(values[0]) or not value.size for value in values):
         raise fail("arrays over runs", "one leading axis of runs, at least one", [np.shape(a) for a in values])
     # Use native code if it supports the function.
     choice = choose_code(function, values, differs_by_run=[True] * len(values))
@@ -70,7 +70,7 @@ def _apply_by_xla(function: Callable[..., PyTree], values: list[np.ndarray], wid
     results = jax.tree.map(lambda leaf: np.empty((runs, *leaf.shape[1:]), leaf.dtype), computed[0])
 
     def copy_back(core: int) -> None:
-        """Copy one core's results to their place, all cores at once since large results take their time."""
+        """Copy one core's results into the array of all runs; by all cores at once, since copying takes time too."""
         for target, leaf in zip(jax.tree.leaves(results), jax.tree.leaves(computed[core]), strict=True):
             target[core * share :][: len(leaf)] = leaf
 
@@ -87,7 +87,7 @@ def _apply_in_blocks(function: Callable[..., PyTree], values: list[np.ndarray], 
     padded = [_pad_runs(a, blocks * width) for a in values]
     by_block = [a.reshape(blocks, width, *a.shape[1:]) for a in padded]
     with jax.enable_x64(True):
-        outputs = to_numpy(_map_blocks(function, by_block))
+        outputs = to_numpy(_map_blocks(function, by_block))  # (block, run of the block, ...)
     return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:runs], outputs)
 
 

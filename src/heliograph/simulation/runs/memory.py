@@ -60,6 +60,7 @@ def check_memory(needed: NeededMemory, runs: int, horizon: int) -> None:
     total, free = sum(needed), find_available_memory()
     if free is None or total <= free:
         return
+    # The part that needs most: the name of its field, and its bytes.
     kind, largest_part = max(needed._asdict().items(), key=lambda item: item[1])
     advice = FEWER if kind == "collected" else LESS
     what_is_largest = f"{largest_part / GB:.3g} GB of them {_DESCRIPTIONS[kind]}"
@@ -69,7 +70,11 @@ def check_memory(needed: NeededMemory, runs: int, horizon: int) -> None:
 
 @contextmanager
 def explain_out_of_memory(runs: int, horizon: int) -> Iterator[None]:
-    """Raise ValueError with one clear line if memory cannot be allocated within the `with` block."""
+    """Raise ValueError with one clear line if memory cannot be allocated within the `with` block.
+
+    `runs`, `horizon`: numbers of runs and steps, which the line names with what would need less. Other errors pass
+    unchanged.
+    """
     try:
         yield
     except (MemoryError, jax.errors.JaxRuntimeError) as error:

@@ -177,7 +177,7 @@ class _Structure(NamedTuple):
     known: tuple[_KnownEntries, ...]
 
     def restore(self, arrays: Iterator[Any]) -> PyTree:
-        """Return the tree with the next arrays in their places."""
+        """Return the tree with the next of these arrays as its leaves, beside its fixed leaves, which are no arrays."""
         leaves = [leaf if f else next(arrays) for leaf, f in zip(self.fixed, self.is_fixed, strict=True)]
         return jax.tree.unflatten(self.tree, leaves)
 
@@ -270,7 +270,7 @@ def _simulate_run(world: World, inputs: jax.Array, reducer: AbstractReducer[Any]
     """
 
     def step(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, OfStep]:
-        """Step the world, and reduce the step."""
+        """Step the world (plant, channels and filters), and return what the reducer makes of the step."""
         state, outputs = _step_world(world, state, key, row)
         return state, reducer.of_step(outputs)
 
@@ -322,16 +322,15 @@ def simulate_natively(
         smoothing: the part of the network that is smoothed; None if nothing is.
         precision: in which runs are computed.
     """
-    # Many nodes that share nothing go in parts, where the reducer has a method of its own to join their results.
+    # More than NODES nodes that share nothing but the plant go in parts, if the reducer can join the parts' results.
     can_be_split = smoothing is None and len(network.names) > NODES and is_apart(network)
     if can_be_split and type(reducer).joined is not AbstractReducer.joined:
         return _simulate_in_parts(network, inputs, key, reducer, (first_run, runs, chunk), progress, precision)
-    code = make_native_or_none(
-        lambda: compile_network_runs(network, inputs, key, reducer, runs, smoothing, precision=precision)
-    )
+    make = partial(compile_network_runs, network, inputs, key, reducer, runs, smoothing, precision=precision)
+    code = make_native_or_none(make)
     if code is None:
         return None
-    check_memory_of_parts(code, 1, runs, len(inputs), precision)
+    check_memory_of_parts(code, parts=1, runs=runs, horizon=len(inputs), precision=precision)
     recorded = NativeRuns(code, first_run, runs, chunk).complete(progress)
     return finish_result(reducer, recorded, network, smoothing)
 
@@ -356,7 +355,7 @@ def _simulate_in_parts(
     results: list[Result] = []
 
     def finish_part(started: NativeRuns, part: Network) -> None:
-        """Append the results of the next of a network's `parts` parts to `results`; show progress in the whole."""
+        """Append the results of the next part of the network to `results`, and report progress in the whole."""
 
         def show_progress(done: int, total: int) -> None:
             if progress is not None:

@@ -74,7 +74,11 @@ class NativeRuns:
         return self._total()._replace(collected=self._join_chunks(collected_by_chunk))
 
     def _start(self, blocks: range) -> "_RunningChunk":
-        """Let threads simulate these blocks of runs: each lane is a thread, which takes its blocks in order."""
+        """Let threads simulate these blocks of runs: each lane is a thread, which takes its blocks in order.
+
+        Block b belongs to lane b mod LANES, and a lane adds its runs to sums of its own, so that results do not depend
+        on the number of threads.
+        """
         numbers, program = np.array(blocks), self.code.begun
         runs_of_lane = {lane: self._list_runs(numbers[numbers % LANES == lane]) for lane in range(LANES)}
         lanes_with_runs = [lane for lane, runs in runs_of_lane.items() if len(runs)]
@@ -95,7 +99,9 @@ class NativeRuns:
 
         A leaf is (run, ...), or None if all runs share it.
         """
-        running = self._first if start == self.chunks[0].start else self._start(range(start, start + blocks))
+        # The first chunk has been running since this object was made.
+        is_first = start == self.chunks[0].start
+        running = self._first if is_first else self._start(range(start, start + blocks))
         # Join each leaf over all lanes, and sort its runs by their numbers.
         order = np.argsort(running.runs, kind="stable")
         leaves: list[np.ndarray | None] = []
@@ -118,15 +124,20 @@ class NativeRuns:
         sums_of_lanes = [sums for sums in self.sums if sums is not None]
         totals = iter(program.add_partial_sums(sums_of_lanes))
         self.memory += sums_of_lanes
-        leaves, are_common = [], []
+        leaves: list[np.ndarray | None] = []
         # `shared`: for each result its value if all runs share it, else None. `summed`: whether it is one to be summed.
         for shared_value, is_summed in zip(program.shared, program.summed, strict=True):
-            by_batch = next(totals) if is_summed and shared_value is None else None
-            leaves.append(by_batch if shared_value is None else to_double(shared_value))
-            are_common.append(shared_value is not None)
-        count = count_runs_by_batch(self.first_run, self.first_run + self.runs)
-        sums, common = (jax.tree.unflatten(self.code.tree, x) for x in (leaves, are_common))
-        return ReducedRuns(sums=sums, common=common, runs=count, collected=None)
+            if shared_value is not None:
+                leaves.append(to_double(shared_value))
+            else:
+                leaves.append(next(totals) if is_summed else None)  # None: collected by run
+        are_common = [shared_value is not None for shared_value in program.shared]
+        return ReducedRuns(
+            sums=jax.tree.unflatten(self.code.tree, leaves),
+            common=jax.tree.unflatten(self.code.tree, are_common),
+            runs=count_runs_by_batch(self.first_run, self.first_run + self.runs),
+            collected=None,
+        )
 
     def _join_chunks(self, collected_by_chunk: Sequence[list[np.ndarray | None]]) -> PyTree:
         """Return what is collected of all runs (run, ...), from a list of results (run, ...) or None for each chunk.

@@ -34,15 +34,16 @@ def is_apart(network: Network) -> bool:
     """
     nodes = [node for node in network.nodes.values() if isinstance(node, Node) and node.filters]
     all_have_filters = len(nodes) == len(network.nodes)
-    are_fused = network.fused or network.meshes
-    return all_have_filters and not are_fused and not any(first(node.channel).remembers for node in nodes)
+    are_fused = bool(network.fused or network.meshes)
+    has_memory = any(first(node.channel).remembers for node in nodes)  # which channels may share
+    return all_have_filters and not are_fused and not has_memory
 
 
 @cache_by_object
 def build_world(network: Network, smoothed_stacks: tuple[int, ...] | None = None) -> World:
     """Return the world of a network, plant, transmission and filters, once for all simulations of it.
 
-    `smoothed_stacks`: numbers of the stacks of filters that are smoothed; None: no smoothing.
+    `smoothed_stacks`: numbers of the stacks (filters of one structure) that are smoothed; None: no smoothing.
     """
     return World(number_unnamed_memories(network.plant), make_reception(network), AllFilters(network, smoothed_stacks))
 
@@ -99,7 +100,10 @@ def _select_nodes(network: Network, names: tuple[str, ...]) -> Network:
 
 
 def _with_fields(module: M, **changed: object) -> M:
-    """Return a copy of a module with these fields changed, made without its constructor, which would compute them."""
+    """Return a copy of a module with these fields changed, made without its constructor, which would compute them.
+
+    `changed`: new values by name of the field; the other fields are those of the module.
+    """
     changed_copy = object.__new__(type(module))
     for field in fields(module):
         value = changed.get(field.name, getattr(module, field.name))
@@ -124,7 +128,11 @@ def _select_rows(world: World, nodes: slice) -> World:
 
 
 def _select_filters(stacked: StackedFilters, nodes: slice) -> StackedFilters:
-    """Return the filters of some nodes; they are stacked filter by filter, node after node for each."""
+    """Return the filters of some nodes; they are stacked filter by filter, node after node for each.
+
+    `nodes`: which of the nodes, by number. The result is a stack like `stacked`, of as many filters at these nodes
+    alone.
+    """
     count = len(range(*nodes.indices(stacked.nodes)))
 
     def select(leaf: PyTree) -> PyTree:

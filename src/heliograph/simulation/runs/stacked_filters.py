@@ -172,7 +172,11 @@ class StackedFilters(Module):
         return map_all(lambda node, state, z: function(node, state, z, u, k), self.nodes)(filters, states, z)
 
     def take_filter(self, filter_number: int, states: PyTree) -> tuple[AbstractFilter, PyTree]:
-        """Return filter number `filter_number` of each node and its state, both with a leading axis of nodes."""
+        """Return filter number `filter_number` of each node and its state, both with a leading axis of nodes.
+
+        The stack has `self.count` filters at each of `self.nodes` nodes, along one axis: the first filter of all nodes,
+        then the second, and so on. `states`: states of all of them, in the same order.
+        """
         begin = filter_number * self.nodes  # the stack has the first filter of all nodes, then the second, and so on
         rows = slice(begin, begin + self.nodes)
 
@@ -201,7 +205,10 @@ def map_all(function: Callable[..., PyTree], size: int) -> Callable[..., PyTree]
 
 
 def _apply_to_one(function: Callable[..., PyTree], *stacked: PyTree) -> PyTree:
-    """Return a function's result for a stack of one, as a stack of one, without the cost of `vmap`."""
+    """Return a function's result for a stack of one, as a stack of one, without the cost of `vmap`.
+
+    A stack is a tree whose arrays have a leading axis, here of length 1.
+    """
 
     def drop_axis(leaf: PyTree) -> PyTree:
         """Return the only row of an array."""

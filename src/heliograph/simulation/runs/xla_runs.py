@@ -72,14 +72,16 @@ def apply_to_each_run(function: Callable[[PyTree], PyTree], values: PyTree) -> P
     Returns:
         The results, with a leading axis of runs too: of length 1 if a result depends on shared values alone.
     """
-    # `traced`: the function of one run as a jaxpr of flat arguments. `shape`: the tree of its results.
     leaves, tree = jax.tree.flatten(values)
     runs = max(len(leaf) for leaf in leaves)
     varies = [len(leaf) == runs for leaf in leaves]
-    of_first_run = [leaf[0] for leaf in leaves]
-    traced, shape = jax.make_jaxpr(lambda *leaves: function(jax.tree.unflatten(tree, leaves)), return_shape=True)(
-        *of_first_run
-    )
+
+    def apply_to_leaves(*leaves: PyTree) -> PyTree:
+        """Return the function's results for one run's values, given as leaves."""
+        return function(jax.tree.unflatten(tree, leaves))
+
+    # The function of one run as a jaxpr of flat arguments, and the tree of its results.
+    traced, shape = jax.make_jaxpr(apply_to_leaves, return_shape=True)(*(leaf[0] for leaf in leaves))
     # A result differs between runs if it depends on an argument that does. JAX's dead-code elimination tells which
     # arguments are needed for one result alone.
     results = range(len(traced.jaxpr.outvars))
@@ -98,7 +100,10 @@ def apply_to_each_run(function: Callable[[PyTree], PyTree], values: PyTree) -> P
 
 
 def list_used_leaves(function: Callable[[PyTree], PyTree], values: PyTree) -> list[PyTree]:
-    """Return the leaves of `values` (numbers or their shapes) on which some result of the function depends."""
+    """Return the leaves of `values` (numbers or their shapes) on which some result of the function depends.
+
+    Other leaves need no memory in a simulation, since XLA does not compute what nothing uses.
+    """
     leaves, tree = jax.tree.flatten(values)
 
     def call_with_leaves(*leaves: PyTree) -> PyTree:
@@ -148,9 +153,12 @@ def _mark_dependent_results(program: ClosedJaxpr, inputs: Sequence[bool]) -> lis
 
 
 def _find_fixed_point(step: Callable[[list[bool]], list[bool]], marks: list[bool]) -> list[bool]:
-    """Return the marks that `step` does not change any more, from `marks` on; marks are only added."""
-    more = [before or after for before, after in zip(marks, step(marks), strict=True)]
-    return marks if more == marks else _find_fixed_point(step, more)
+    """Return the marks that `step` adds nothing to any more: `marks`, with those that `step` adds again and again."""
+    while True:
+        more = [before or after for before, after in zip(marks, step(marks), strict=True)]
+        if more == marks:
+            return marks
+        marks = more
 
 
 def _put_runs_first(leaves: Sequence[jax.Array], varies: Sequence[bool]) -> list[jax.Array]:

@@ -1,6 +1,6 @@
 """Transmission of a network, built: its nodes by structure, or the slots and hops of its relays."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from heliograph.simulation.transmission.slotted_relays import SlottedRelays, fin
 
 
 def make_reception(network: Network) -> AbstractMedium:
-    """Return the medium of a network: what transmits from the plant to its nodes."""
+    """Return the medium of a network: what transmits from the plant to its nodes, over sensors, channels and relays."""
     if network.relays is not None:
         return _make_slots(network, network.relays)
     if network.common is not None:
@@ -51,7 +51,10 @@ def make_reception(network: Network) -> AbstractMedium:
 
 
 def _make_slots(network: Network, relays: RelayNetwork) -> SlottedRelays:
-    """Return the medium of a network's relays, which send to each other in slots, one after another within a step."""
+    """Return the medium of a network's relays, which send to each other in slots, one after another within a step.
+
+    A slot says who sends to whom over which hop (link); slots take turns, step by step. The medium is what transmits.
+    """
     number_of_listener = {name: i for i, name in enumerate(relays.filters)}
     listeners_by_group = [tuple(number_of_listener[name] for name in names) for names in network.groups]
     hops = {name: hop.channel for name, hop in find_hops_with_memory(relays).items()}
@@ -75,19 +78,19 @@ def _stack_group(network: Network, nodes: Mapping[str, Node], memories_of: Mappi
     """
     first_name, first_node = next(iter(nodes.items()))
     # Sensors and channels. Memories are told apart by the numbers that seed them: without their names the nodes stack.
-    pairs = [(without_output_names(node.sensor), _get_carrying_channel(node)) for node in nodes.values()]
-    pairs = [drop_names(pair) if len(memories_of[name]) else pair for pair, name in zip(pairs, nodes, strict=True)]
+    pairs, seeds = [], []
+    for name, node in nodes.items():
+        pair = without_output_names(node.sensor), _get_carrying_channel(node)
+        pairs.append(drop_names(pair) if len(memories_of[name]) else pair)
+        seeds.append(_split_seeds((node.sensor, node.channel), memories_of[name]))
     sensor, channel = stack(pairs)
-    seeds = [_split_seeds((node.sensor, node.channel), memories_of[name]) for name, node in nodes.items()]
-    sensor_seeds, channel_seeds = (np.stack(parts) for parts in zip(*seeds, strict=True))
+    sensor_seeds, channel_seeds = (np.stack(seeds_of_nodes) for seeds_of_nodes in zip(*seeds, strict=True))
     # What the sender knows of the receiver: the filter that is fed back to it, or whose prediction it compares with.
     filter_name: str | None = first_node.informed_by or first_node.predictor
     reference: PyTree = None
     if filter_name is not None:
         reference = stack([without_output_names(node.filters[filter_name]) for node in nodes.values()])
     index_of_reference = None if filter_name is None else network.estimate_indices[first_name, filter_name]
-    triggers: PyTree = [node.trigger for node in nodes.values()]
-    encoders: PyTree = [node.encoder for node in nodes.values()]
     return NodeGroup(
         sensor=sensor,
         inputs=network.inputs,
@@ -96,11 +99,16 @@ def _stack_group(network: Network, nodes: Mapping[str, Node], memories_of: Mappi
         memories=channel_seeds,
         modes=sensor_seeds,
         reference_filter=reference,
-        trigger=None if triggers[0] is None else stack(triggers),
-        encoder=None if encoders[0] is None else stack(encoders),
+        trigger=_stack_if_any([node.trigger for node in nodes.values()]),
+        encoder=_stack_if_any([node.encoder for node in nodes.values()]),
         informed_at=None if index_of_reference is None else (index_of_reference.stack, index_of_reference.filter),
-        reader=None if encoders[0] is None else make_word_reader(first_node.channel),
+        reader=None if first_node.encoder is None else make_word_reader(first_node.channel),
     )
+
+
+def _stack_if_any(parts: Sequence[PyTree]) -> PyTree:
+    """Return the triggers, or the encoders, of a group's nodes stacked; None where the nodes have none."""
+    return None if parts[0] is None else stack(parts)
 
 
 def _get_carrying_channel(node: Node) -> Channel:

@@ -140,8 +140,14 @@ class LateChannelState(NamedTuple):
 def start_channel(channel: Channel, key: jax.Array, source: Number, shared: MemoryNumbers) -> PyTree:
     """Return a channel's state before the first step of the run with this key.
 
-    A channel that delivers late also keeps past signals, which are zeros here. `source`: the number that seeds its own
-    draws. `shared`: the numbers that seed those of its memories.
+    The state has that of the channel's memories, such as fading or a Markov chain of losses. A channel that delivers
+    late also keeps the signals of its last `past` steps, which are zeros here.
+
+    Args:
+        channel: a link, or one for each step.
+        key: key of the run.
+        source: number that seeds the link's own draws.
+        shared: numbers that seed the draws of its memories, one for each: links with a memory of one number share it.
     """
     link, link_key = at(channel, k=0), draw_key(key, k=0, source=source, purpose=CHANNEL_START)
     keys = [draw_key(key, k=0, source=memory, purpose=MEMORY_START) for memory in shared]
@@ -151,9 +157,15 @@ def start_channel(channel: Channel, key: jax.Array, source: Number, shared: Memo
 
 
 def start_modes(models: PyTree, key: jax.Array, shared: MemoryNumbers) -> tuple[jax.Array, ...]:
-    """Return the states of the memories of a plant or sensor at the first step of the run with this key."""
-    numbered = zip(memories(models).values(), shared, strict=True)
-    return tuple(memory.begin(draw_key(key, k=0, source=number, purpose=MEMORY_START)) for memory, number in numbered)
+    """Return the states (modes) of the memories of a plant or sensor at the first step of the run with this key.
+
+    A memory is a state that is random over time, such as a Markov chain of modes. `shared`: the numbers that seed their
+    draws; memories of one number begin alike.
+    """
+    states = []
+    for memory, number in zip(memories(models).values(), shared, strict=True):
+        states.append(memory.begin(draw_key(key, k=0, source=number, purpose=MEMORY_START)))
+    return tuple(states)
 
 
 def move_modes(
@@ -163,8 +175,10 @@ def move_modes(
 
     `shared`: the numbers that seed their draws. Memories with one number move alike.
     """
-    states_and_seeds = zip(memories(models).values(), states, shared, strict=True)
-    return tuple(memory.move(state, draw_key(key, k, number, MEMORY)) for memory, state, number in states_and_seeds)
+    after = []
+    for memory, state, number in zip(memories(models).values(), states, shared, strict=True):
+        after.append(memory.move(state, draw_key(key, k, number, MEMORY)))
+    return tuple(after)
 
 
 def deliver_signal(

@@ -141,10 +141,14 @@ class SeparateChannels(AbstractMedium):
             memory = start_channel(group.channel, key, group.checksums, group.memories)
             return LinkState(memory=memory, feed_back=feed_back, sender=sender, modes=modes)
 
-        return tuple(
-            () if isinstance(group, NodesWithoutSensor) else map_all(start_node, len(group.checksums))(group)
-            for group in self.groups
-        )
+        states: list[PyTree] = []
+        for group in self.groups:
+            if isinstance(group, NodesWithoutSensor):
+                states.append(())
+            else:
+                nodes = len(group.checksums)
+                states.append(map_all(start_node, nodes)(group))
+        return tuple(states)
 
     def receive(
         self, state: PyTree, x: jax.Array, u: jax.Array, key: jax.Array, k: jax.Array
@@ -183,7 +187,8 @@ class SeparateChannels(AbstractMedium):
         def feed_group(group: NodeGroup | NodesWithoutSensor, link: PyTree) -> PyTree:
             """Return the links of one group of nodes with the estimates that are fed back to their senders.
 
-            `group.informed_at`: (stack, filter) of these estimates, or None if nothing is fed back.
+            `group.informed_at`: (stack, filter) of these estimates in the stacked filters, or None if nothing is fed
+            back.
             """
             if group.informed_at is None:
                 return link
@@ -198,8 +203,11 @@ class SeparateChannels(AbstractMedium):
         A trigger decides whether a sender transmits, and stores the reason of its last decision (`sender.last`) for
         each of the m components.
         """
-        links = ((g, link) for g, link in enumerate(state) if isinstance(link, LinkState))
-        return {str(g): link.sender.last for g, link in links if link.sender is not None}
+        reasons = {}
+        for group, link in enumerate(state):
+            if isinstance(link, LinkState) and link.sender is not None:  # its nodes have sensors and triggers
+                reasons[str(group)] = link.sender.last
+        return reasons
 
 
 def _transmit(

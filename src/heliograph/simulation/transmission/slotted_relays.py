@@ -93,7 +93,11 @@ class SlottedRelays(AbstractMedium):
         return RelayStates(state.estimates, hop_states), received_by_group
 
     def feed_back(self, state: RelayStates, estimates: Sequence[Estimate]) -> RelayStates:
-        """Return the state with the relays' estimates, to be sent at the next step."""
+        """Return the state with the relays' new estimates, which they send at the next step.
+
+        `estimates`: of all filters by stack (of one structure), with mean (filter, node, n). `self.estimates_at`: where
+        each relay's stands.
+        """
         means = [estimates[index.stack].mean[index.filter, index.node] for index in self.estimates_at]
         return RelayStates(jnp.stack(means) if means else state.estimates, state.hops)
 
@@ -132,6 +136,8 @@ class SlottedRelays(AbstractMedium):
             """Return what each listener receives at step k, by name, in the slot at this position of the stack.
 
             `sent`: the signal of each sender, by name. `key`: key of the run.
+
+            `self.relays.received`: how many numbers each listener receives.
             """
             slot: PyTree = at(stacked, position) if isinstance(stacked, OverTime) else stacked
             listeners = zip(self.relays.filters, self.relays.received, strict=True)
