@@ -42,8 +42,8 @@ class EventTable:
     Where the network counts steps, times are steps and events arrive at once; with the seconds of a `step` times are
     moments, each of the step that is nearest, counted from the first.
 
-    An event is named by its node, its time and its count; without a count those of equal time are told apart by their
-    order of arrival.
+    An event is identified by its node, its time and its running count; without a count, events of equal time are
+    distinguished by their order of arrival.
 
     Args:
         network: the network.
@@ -61,14 +61,16 @@ class EventTable:
     def __init__(self, network: Network, step: float | None = None, start: int | None = None, numbers: bool = False):
         """Begin without events; `step`: seconds of a step; `start`: time of step 0; `numbers`: times are not dates."""
         instance("network", network, Network, "a Network")
-        self.network, self.steps, self.numbers, self.start = network, TIME_STEP not in network.inputs, numbers, start
+        self.network, self.numbers, self.start = network, numbers, start
+        self.steps = TIME_STEP not in network.inputs  # whether the network counts steps
         self.step = None if step is None else round(scalar("step", step, 1 / SECOND) * SECOND)  # in nanoseconds
-        self._plants: dict[str, dict[str, NodeEvents]] = {}
-        self.notes: list[str] = []
-        self.broken = ""
+        self._plants: dict[str, dict[str, NodeEvents]] = {}  # columns by plant and node
+        # What is reported of the reading.
+        self.notes, self.broken = list[str](), ""
         self.refused, self.reasons = 0, list[str]()
 
     def __len__(self) -> int:
+        """Return how many events there are, of all plants and nodes and of inputs."""
         return sum(len(columns.time) for plant in self._plants.values() for columns in plant.values())
 
     @property
@@ -131,7 +133,7 @@ class EventTable:
         values: Float[np.ndarray, "events size"],
         period: int,
     ) -> None:
-        """Append readings of a node as `add` does one after another; `NONE` is no time, -1 no count."""
+        """Append readings of a node, as `add` does with one; a time NONE means no time, a sequence -1 no count."""
         columns = self._columns_of_plant("")[node]
         time = np.where(time == NONE, arrival, time)
         for column, moments in ((columns.time, time), (columns.arrival, time if self._times_are_steps else arrival)):
@@ -141,7 +143,7 @@ class EventTable:
         columns.period = period
 
     def note_unread(self, unread: Unread, arrival: float | None) -> None:
-        """Note count and reason of a message that could not be read, where its node is known."""
+        """Note the running count of a message that could not be read, and why, if its node is known."""
         if unread.counted is not None:
             self._columns_of_plant(unread.counted.plant)[unread.counted.node].note_unread(unread, arrival)
 
@@ -178,13 +180,14 @@ class EventTable:
         Raises:
             ValueError: no event, and a message that could not be read; a stamp that was not set.
         """
-        by_node = [of_node for plant in self._plants.values() for of_node in plant.items()]
-        if self.dated or not self.steps:  # step numbers are no stamps
+        by_node = [item for columns_by_node in self._plants.values() for item in columns_by_node.items()]
+        if self.dated or not self.steps:
             for name, columns in by_node:
                 self._leave_out_unset_stamps(f"{source}, {name}", columns, strict)
-        # Without an event the first thing that went wrong is the error.
-        if not len(self) and (first := (*self.reasons, self.broken)[0]):
-            raise InputError(first)
+        # Nothing could be read: raise the first refused message's reason, or else why reading ended early.
+        first_trouble = self.reasons[0] if self.reasons else self.broken
+        if not len(self) and first_trouble:
+            raise InputError(first_trouble)
         if not self.steps:
             self.notes += [line for name, columns in by_node for line in columns.list_lost_digits(f"{source}, {name}")]
 
@@ -226,7 +229,7 @@ class EventTable:
 
     @property
     def _unit(self) -> int:
-        """Return how many units of the columns one unit of time has."""
+        """Return how many units of the columns make one unit of time: 10^9 nanoseconds a second, else 1."""
         return 1 if self.steps or self.numbers else SECOND
 
     @property
@@ -337,7 +340,7 @@ class EventTable:
         events = events.select(verdicts == USED)
         if not len(events.time):
             raise fail("events", "at least one that is used", "none")
-        # In order; inputs, of number -1, first at each time.
+        # In order of time; of one time the inputs, whose node number is -1, come first.
         events = events.select(np.lexsort((events.sequence, events.node, events.time)))
         if self.steps and events.time[-1] >= MOST_STEPS:  # each step is a row
             raise fail("time of an event", f"a step below {MOST_STEPS:,}", int(events.time[-1]))
