@@ -56,10 +56,15 @@ def open_logs(path: Path, sources: LogSources, wanted: Wanted) -> Log:
 
 
 def open_log(path: Path, sources: LogSources, wanted: Wanted) -> Log:
-    """Open a vehicle's log; its format follows from its extension, and only wanted messages are decoded.
+    """Open a vehicle's log; its format follows from its extension.
 
-    ULog files, and MDF files without a database, hold decoded signals. All others hold frames, which a database
-    decodes.
+    ULog files, and MDF files without a database, hold decoded signals. All others hold frames of a CAN bus, raw bytes
+    from which a database of the bus's messages (DBC) decodes signals.
+
+    Args:
+        path: the log.
+        sources: what decodes it: the database, the channel of the bus, and when the log began.
+        wanted: function that returns whether messages of a name are to be decoded.
 
     Raises:
         ValueError: there is no such file, it cannot be opened, or it holds frames and there is no database.
@@ -76,7 +81,7 @@ def open_log(path: Path, sources: LogSources, wanted: Wanted) -> Log:
 
 
 def read_log(path: Path, table: object, sources: TopicReader, notes: list[str]) -> Iterator[FileMessage | InputError]:
-    """Yield the messages of a log that sources ask for, in order of time, or why one cannot be read.
+    """Yield the messages of a log that sources ask for, in order of time; an error in place of one that is unreadable.
 
     A log is a vehicle's or bus's file of signals over time; sources say which signals are a node's values. The logs in
     a folder are read one after another. Each message that is asked for must be in one of them.
@@ -94,7 +99,7 @@ def read_log(path: Path, table: object, sources: TopicReader, notes: list[str]) 
     given = table if isinstance(table, LogSources) else LogSources({})
     log = open_logs(path, given, lambda name: bool(sources.of(name)))
     where = str(path) if given.dbc is None else f"{path} by {given.dbc}"
-    # The units of the signals that are used, for the notes; it raises if a signal is missing.
+    # The units of the signals that are used, for the notes; this raises ValueError if a signal is missing.
     used = _find_signal_units(where, path, log, sources)
     yield from log.messages
     notes += log.notes
