@@ -14,11 +14,11 @@ NamesByNode = Mapping[str, tuple[str, ...]]  # names of each node's numbers; und
 
 
 class MappedSource(NamedTuple):
-    """A source, the pattern of its topics, and which numbers of a node's measurement its values are, by node."""
+    """A source, checked against the network: its fields are known to be certain numbers of a node's measurement."""
 
     source: Source
-    pattern: str
-    indices_by_node: dict[str, np.ndarray]
+    pattern: str  # its topic, which may have wildcards
+    indices_by_node: dict[str, np.ndarray]  # for each of its values, (values,), the index in the node's measurement
 
 
 def map_sources(topic: object, items: object, names: NamesByNode, time_counts_steps: bool) -> list[MappedSource]:
@@ -42,7 +42,7 @@ def map_sources(topic: object, items: object, names: NamesByNode, time_counts_st
     for source in sources:
         _check_wildcards(topic, source)
         mapped.append(MappedSource(source, topic, _find_output_indices(topic, source, names)))
-        # `of` raises where the topic has not the level that a condition asks for; "#" may be of any levels.
+        # `of` raises ValueError if the topic lacks a level that a condition asks for; "#" may stand for any levels.
         for condition in source.available if "#" not in topic else ():
             condition.of(topic)
         _check_time_unit(topic, source, time_counts_steps)

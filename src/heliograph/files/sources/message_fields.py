@@ -20,7 +20,7 @@ from heliograph.numerics.times.dates import UNITS, parse_dates, parse_instant
 TimeUnit = Literal["s", "ms", "us", "ns", "step"]
 # Fields of a stamp, of seconds and nanoseconds: of ROS 2 and 1, protobuf, Foxglove.
 STAMPS = (("sec", "nanosec"), ("secs", "nsecs"), ("seconds", "nanos"), ("sec", "nsec"))
-PLAIN = (Mapping, list, tuple, str, int, float, np.ndarray, type(None))
+PLAIN = (Mapping, list, tuple, str, int, float, np.ndarray, type(None))  # any other message is an object of rosbags
 NUMBER = "a number, true or false, or null for what did not arrive"
 EXACT, DIGITS = 2**53, 20  # up to here doubles hold every whole number; as many digits at most have 64 bits
 SHORT = 16  # characters: a double tells apart any two numbers of 15 digits and a point
@@ -74,7 +74,7 @@ def decode_items(text: str | bytes, name: str) -> list[tuple[Any, str | None]]:
 
 
 def fail_of_doubled(name: str, field: str) -> InputError:
-    """Return the error of an object of JSON that has a field twice, of which decoders use the last."""
+    """Return the error for an object of JSON that has a field twice; decoders would silently use the last one."""
     return fail(name, "distinct fields", f"{field!r} more than once")
 
 
@@ -124,7 +124,7 @@ def _name_doubled_field(content: Any, doubled: list[tuple[dict[str, Any], str]])
 
 
 def _flatten_lists(content: object) -> Iterator[object]:
-    """Yield each item of a list, or of lists in it; what is no list as the one item."""
+    """Yield the items of a list, and of lists inside it, one by one; anything but a list is yielded itself."""
     for item in content if isinstance(content, list) else [content]:
         yield from _flatten_lists(item) if isinstance(item, list) else [item]
 
@@ -176,7 +176,7 @@ def field_at(message: object, path: str, where: str) -> Any:
 
 @lru_cache
 def _make_attribute_getter(path: str) -> "attrgetter[Any]":
-    """Return what reads a dotted path of attributes."""
+    """Return a function that reads the attribute at a dotted path of an object; cached, since paths are few."""
     return attrgetter(path)
 
 
@@ -231,10 +231,10 @@ def convert_time(value: Any, unit: TimeUnit, name: str, quoted: bool = False) ->
     """Return a time in nanoseconds since 1970, or as a step if that is its unit.
 
     Args:
-        value: a stamp of two whole numbers, a date with its zone, or a number.
-        unit: of a number.
-        name: of the value, for errors.
-        quoted: whether a number in quotes is one.
+        value: a stamp (seconds and nanoseconds), a date with its zone, or a number.
+        unit: unit of a time that is a number.
+        name: name of the value, for errors.
+        quoted: whether a text such as "1.5" counts as a number.
 
     Raises:
         ValueError: no time; a date without a zone; a stamp of zero, which nobody has set.
@@ -326,7 +326,7 @@ def convert_count(value: Any, name: str, quoted: bool = False) -> int:
 
 
 def convert_name(value: Any, name: str) -> str:
-    """Return the name of a plant or a node as a text; it may be a whole number."""
+    """Return the name of a plant or a node as a text; `value` may be an integer, `name` is its place, for errors."""
     if isinstance(value, int | np.integer) and not isinstance(value, bool):
         return str(int(value))
     if isinstance(value, float) and value.is_integer():
@@ -337,7 +337,7 @@ def convert_name(value: Any, name: str) -> str:
 
 
 def _list_field_names(value: object) -> str:
-    """Return the names of a value's fields for an error; the value itself where it has no fields."""
+    """Return the names of a value's fields, for an error, in at most 200 letters; a value without fields itself."""
     if isinstance(value, Mapping):
         names = [str(key) for key in value]
     elif hasattr(value, "__dataclass_fields__"):

@@ -33,7 +33,7 @@ class Level:
     names: Mapping[str, str] | None = None
 
     def of(self, topic: str, message: object, where: str) -> str:
-        """Return the topic's level number `self.index`, replaced by its name in `self.names` if there is one."""
+        """Return the topic's level number `self.index`, or its name in `self.names`. `where`: place for errors."""
         levels = topic.split("/")
         if not -len(levels) <= self.index < len(levels):
             raise fail(where, f"a topic with a level {self.index}", repr(topic))
@@ -55,7 +55,7 @@ class Field:
     names: Mapping[str, str] | None = None
 
     def of(self, topic: str, message: object, where: str) -> str:
-        """Return the name that a field of the message gives; `where`: place of the message, for errors."""
+        """Return a message's field at `self.path`, or its name in `self.names`. `where`: place for errors."""
         name = convert_name(field_at(message, self.path, where), f"{where}, field {self.path!r}")
         return (self.names or {}).get(name, name)
 
@@ -367,7 +367,7 @@ def _split_conditions(where: object) -> tuple[Allowed, tuple[Available, ...]]:
 
 
 def _read_valid_flags(valid: object) -> Flags:
-    """Return {path of a flag: its values in a message that can be trusted}; a path alone has true or 1."""
+    """Return {path of a flag: its values in a message that can be trusted}; `valid`: such, or a path (true or 1)."""
     if valid is None or isinstance(valid, str):
         return None if valid is None else {valid: (True, 1)}
     if not isinstance(valid, Mapping):

@@ -52,7 +52,7 @@ class TopicReader:
         self.stored = 0  # a broker's stored messages without a time: they arrive on subscribing, so have no date
         self.excluded = Counter[str]()  # messages that a condition leaves out, by topic
         self.offline = Counter[str]()  # messages of devices that had said that they are offline, by topic
-        # By pattern of topics and path of a field: the error of the first message without it; which ones have come.
+        # By pattern of topics and path of a field: the error of the first message without it, and those that came.
         self.absent, self.found = dict[tuple[str, str], str](), set[tuple[str, str]]()
         # By plant and node: the newest reading, its moment, and whether its count ever differed from the one before.
         self._last = dict[tuple[str, str], tuple[Reading, int, bool]]()
@@ -115,7 +115,7 @@ class TopicReader:
 
     @property
     def columns(self) -> set[str]:
-        """Return the columns, of rows of a table, of which the sources say what they mean."""
+        """Return the columns of a table that the sources read: paths of their fields, and the paths' first words."""
         mapped = [single.source for several in self._table.values() for single in several]
         return {name for source in mapped for path in source.fields for name in (path, path.split(".")[0])}
 
@@ -174,6 +174,7 @@ class TopicReader:
         if reading.sequence is None or reading.time is None or moment is None or has_no_seconds:
             return reading
         key = reading.plant, reading.node
+        # The node's last reading, when it came, and whether its count has ever changed. Before the first, no copy fits.
         before, moment_before, count_moved = self._last.get(key, (reading, -COPY - 1, False))
         may_be_copy = reading.sequence == before.sequence and count_moved and 0 <= moment - moment_before <= COPY
         if may_be_copy and np.array_equal(reading.values, before.values, equal_nan=True):
@@ -183,13 +184,16 @@ class TopicReader:
 
     def describe_absent_field(self) -> str:
         """Return the error of the first field that no message of its topic had; "" if there is none."""
-        return next((said for key, said in self.absent.items() if key not in self.found), "")
+        return next((error for key, error in self.absent.items() if key not in self.found), "")
 
     def _read_by_source(self, mapped: MappedSource, topic: str, message: object, where: str) -> Reading | None:
         """Return a message's reading by one source; None if a condition leaves it out or another process reads it.
 
-        A source (`mapped`) says which fields of a message are which outputs of a node, by their indices
-        (`indices_by_node`).
+        Args:
+            mapped: the source, with the index of each of its values among those of a node.
+            topic: topic of the message.
+            message: the message, decoded.
+            where: place of the message, for errors.
 
         Raises:
             ValueError: a field that is not there, or is no number, time or count; one line that names it.
@@ -201,11 +205,8 @@ class TopicReader:
         if node in self.others:
             return None
         if node not in mapped.indices_by_node:
-            raise fail(
-                f"{where}, node",
-                f"one of {', '.join(mapped.indices_by_node)}",
-                suggest_name(node, mapped.indices_by_node),
-            )
+            known = mapped.indices_by_node
+            raise fail(f"{where}, node", f"one of {', '.join(known)}", suggest_name(node, known))
         source.check_valid(message, where)
         sequence, is_count_absent = self._read_message_count(source, pattern, message, where)
         # A message with a count may lack values: it measured nothing.
@@ -283,26 +284,33 @@ def _read_names(mapped: MappedSource, topic: str, message: object, where: str) -
     """Return the names of a message's plant and node; the plant is "" if there is only one."""
     source = mapped.source
     node = source.node if isinstance(source.node, str) else source.node.of(topic, message, where)
-    return "" if source.plant is None else source.plant.of(topic, message, where), node
+    plant = "" if source.plant is None else source.plant.of(topic, message, where)
+    return plant, node
 
 
 def _read_time(source: Source, message: object, where: str) -> int | None:
-    """Return the time that names a measurement, in nanoseconds since 1970 or steps; None if the source has none."""
+    """Return the time of measuring in a message, in nanoseconds since 1970 or steps; None if the source has none."""
     return None if source.time is None else source.time.of(message, source.time_unit, where, source.quoted)
 
 
 def _describe_rest(count: int) -> str:
-    """Return how many of a list are not named in a line; "" if all are."""
+    """Return " and N more" for a list of `count` names of which only the first LISTED are shown; "" if all are."""
     return "" if count <= LISTED else f" and {count - LISTED} more"
 
 
 def _read_value(message: object, path: str | Computed, where: str, quoted: bool) -> float:
-    """Return the number at a path, or one computed from several; NaN if it is missing; `quoted`: it may be a text."""
+    """Return the number at a path, or one computed from several; NaN for null or a number that is not finite.
+
+    `where`: place of the message, for errors. `quoted`: whether a text such as "1.5" counts as a number. If there is no
+    such field, MissingFieldError is raised.
+    """
     if isinstance(path, ZeroIfAbsent):  # a field that senders leave out where it is 0
         path_of_parent, _, name = path.path.rpartition(".")
         parent = field_at(message, path_of_parent, where)
-        return 0.0 if isinstance(parent, Mapping) and name not in parent else _read_value(parent, name, where, quoted)
-    if not isinstance(path, str):
+        if isinstance(parent, Mapping) and name not in parent:
+            return 0.0
+        return _read_value(parent, name, where, quoted)
+    if not isinstance(path, str):  # several fields and what is computed from them
         return float(path.of(*(_read_value(message, field, where, quoted) for field in path.parts)))
     value = field_at(message, path, where)
     if type(value) is float:  # the common case, without making the place's name for errors

@@ -16,7 +16,7 @@ ASKS = re.compile(r"(?<=[?&])(query|flux|sql)=")  # begins a statement, which go
 
 @dataclass(frozen=True)
 class StoreAddress:
-    """Where a table is kept, or what asks for one; printed it is the URL without user, password and query.
+    """Where a table is kept, or the statement that asks for one; `str` of it is the URL without secrets and query.
 
     Attributes:
         kind: scheme of the URL: "influx", "influxs" (TLS) or "postgresql".
@@ -48,7 +48,7 @@ class StoreAddress:
         return self.table or ESTIMATES
 
     def with_table(self, table: str) -> "StoreAddress":
-        """Return the address of another table there."""
+        """Return the address of another table of the same database."""
         return replace(self, table=table)
 
     @property
@@ -68,7 +68,7 @@ def is_store(location: object) -> bool:
     return isinstance(location, str) and location.split("://")[0] in (*INFLUX, *POSTGRES) and "://" in location
 
 
-ASKED = "one of table=NAME and query=SELECT..."
+ASKED = "one of table=NAME and query=SELECT..."  # what is expected, in errors
 ESCAPED = "a user and a password in which / ? # and @ are written %2F %3F %23 and %40"
 
 
@@ -84,7 +84,7 @@ def parse_store(url: str) -> StoreAddress:
     from heliograph.numerics.check import fail, text  # not before a command needs it
 
     text("store", url)
-    # "scheme://.../database?options", then "query", "flux" or "sql" and the statement, where there is one.
+    # "scheme://.../database?options&", then "query", "flux" or "sql" and the statement; these are "" if there is none.
     location, language, statement = [*ASKS.split(url, maxsplit=1), "", ""][:3]
     try:
         parts = urlsplit(location)
@@ -99,7 +99,7 @@ def parse_store(url: str) -> StoreAddress:
         raise fail("store", SHAPE, f"{parts.scheme}://{host or ''}{parts.path}")
     store = f"store {parts.scheme}://{host or ''}/{database}"
     # The options before the statement. A URL has one table or one statement, in a language that the server has.
-    table, organisation = _read_options(store, parts.query, is_influx, asks=bool(language))
+    table, organisation = _read_options(store, parts.query, is_influx, has_statement=bool(language))
     if language and not statement.strip():
         raise fail(store, ASKED, "both, or one without a value")
     if not is_influx and language not in ("", "query"):
@@ -117,21 +117,22 @@ def parse_store(url: str) -> StoreAddress:
     )
 
 
-def _read_options(store: str, options: str, is_influx: bool, asks: bool) -> tuple[str, str]:
-    """Return the table and the organisation that options of a URL name, "" where they name none.
+def _read_options(store: str, options: str, is_influx: bool, has_statement: bool) -> tuple[str, str]:
+    """Return (table, organisation) that the options of a URL name; "" for one that they do not name.
 
     Args:
         store: the store, for errors.
-        options: the options, "table=NAME&org=NAME"; of PostgreSQL others are the server's.
+        options: the options, such as "table=NAME&org=NAME". Other options of PostgreSQL are ignored here: the server
+            gets them.
         is_influx: whether the store is InfluxDB, which has no other options than these two.
-        asks: whether the URL has a statement (a query); then no table may be named.
+        has_statement: whether the URL has a statement (a query); then no table may be named.
 
     Raises:
-        ValueError: an option that InfluxDB has not, several tables, a table beside a statement.
+        ValueError: another option of InfluxDB, several tables, or a table beside a statement.
     """
     from heliograph.numerics.check import fail
 
-    # The table's option, and all others, one of which may be InfluxDB's organisation.
+    # Split the options into the table's and the others, of which InfluxDB's organisation is taken out.
     decoded = [unquote(option) for option in options.split("&") if option]
     tables = [option.removeprefix("table=") for option in decoded if option.startswith("table=")]
     others = [option for option in decoded if not option.startswith("table=")]
@@ -140,7 +141,7 @@ def _read_options(store: str, options: str, is_influx: bool, asks: bool) -> tupl
         organisation = others.pop().removeprefix("org=")
     if is_influx and others:
         raise fail(store, ASKED, others[0].split("=")[0])
-    if asks and tables:
+    if has_statement and tables:
         raise fail(store, ASKED, "both, or one without a value")
     if len(tables) > 1:
         raise fail(store, ASKED, "several")
