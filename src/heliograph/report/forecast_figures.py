@@ -40,6 +40,7 @@ def draw_forecasts(
         names: names of all filters, in the order of their colours.
         sigmas: half width of a band, in claimed deviations.
     """
+    # A filter's colour is that of its position among all filters, with a forecast or without.
     for number, name in enumerate(names):
         if name not in forecasts:
             continue
@@ -94,7 +95,7 @@ def _make_forecast_table(record: Record, name: str, forecast: "heliograph.foreca
 
 
 def _format_mean_and_interval(mean: float, low: float, high: float, deviation: float) -> str:
-    """Return mean and interval as text, to two digits of the deviation; only the mean if the deviation is NaN."""
+    """Return the text "mean (low to high)", to two digits of the deviation; only the mean if the deviation is NaN."""
     if np.isnan(deviation):
         return f"{mean:.4g}"
     return f"{round_to(mean, deviation)} ({round_to(low, deviation)} to {round_to(high, deviation)})"

@@ -13,9 +13,10 @@ PREFIX = "modes_"  # of the names of figures, before that of a node's estimates
 
 
 def draw_modes_of_nodes(record: Record, kind: str, nodes: Sequence[str]) -> dict[str, Figure]:
-    """Return {name: figure} of the modes' probabilities, for each node with a filter that weighs modes.
+    """Return {file name: figure} of the modes' probabilities, for each node with a filter that estimates modes.
 
-    The name consists of "modes_" (PREFIX), `kind` and the node's index.
+    The file name is "modes_KIND_i" with the node's index i in `nodes`; `kind` is "estimates" or "smoothed". The modes
+    are the states of a Markov chain that switches the model.
     """
     figures = {}
     for i, node in enumerate(nodes):

@@ -15,7 +15,7 @@ from heliograph.simulation.results.record import Record
 PAIRS = (("x", "y"), ("east", "north"), ("e", "n"), ("px", "py"), ("pos_x", "pos_y"), ("position_x", "position_y"),
          ("x_position", "y_position"), ("lon", "lat"), ("longitude", "latitude"))  # fmt: skip
 ELLIPSES = 12  # of the claimed covariance along the path
-SIGMAS = 2.0
+SIGMAS = 2.0  # semi-axes of an ellipse, in claimed deviations
 
 
 def find_coordinates(states: Sequence[str]) -> tuple[int, int] | None:

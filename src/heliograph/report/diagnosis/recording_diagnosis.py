@@ -91,7 +91,7 @@ def examine(
 def _explain_doubts(network: Network, health: Health, inputs: np.ndarray) -> Health:
     """Return the diagnosis with what may explain doubts: a constant error of an output or node, another unit of time.
 
-    Where an output is stuck, no constant error between nodes is looked for.
+    A stuck output makes nodes disagree, too; then no constant error between nodes is looked for.
     """
     errors = {
         (filter.node, filter.filter): _find_constant_error(network, health, filter, inputs)
@@ -150,7 +150,7 @@ def _doubt_time_unit(network: Network, health: Health, inputs: np.ndarray) -> st
 
 
 def _find_judged_filter(network: Network, record: Record, judged: FilterHealth) -> FilterWithMeasurements:
-    """Return the filter that was judged, with what it listens to."""
+    """Return the filter whose innovations were judged, with its measurements."""
     listeners = yield_filters_with_measurements(network, record)
     return next(one for one in listeners if (one.node, one.name) == (judged.node, judged.filter))
 
@@ -170,7 +170,7 @@ def _find_constant_error(
 
 
 def _name_time_unit(record: Record) -> str:
-    """Return the unit of the times of a record, in words."""
+    """Return the name of the unit of a record's times: that of the column, "s" for dates, else a general phrase."""
     return record.units.get("time", "s" if record.time.dtype.kind == "M" else "of the unit of time")
 
 

@@ -27,14 +27,14 @@ class SendingRate(NamedTuple):
 
 
 class _PeriodicRows(NamedTuple):
-    """Rows r that come right after a multiple of the period: frac(frequency r - start) at most `width`."""
+    """Rows r that come right after a multiple of the period: frac(frequency r - start) <= width."""
 
-    frequency: float
-    start: float
-    width: float
+    frequency: float  # periods per row
+    start: float  # phase of the earliest row in its period
+    width: float  # of the interval of phases, in periods
 
     def phases(self, rows: Int[np.ndarray, " rows"]) -> Float[np.ndarray, " rows"]:
-        """Return how many periods after the first each row is."""
+        """Return the phase of each row, frequency r - start, in periods; its integer part numbers the period."""
         return np.asarray(self.frequency * rows - self.start)
 
 
@@ -72,7 +72,8 @@ def _find_slowest_rate(arrived: Bool[np.ndarray, " time"]) -> SendingRate | None
     if len(rows) < FEWEST or came_in_each_row:
         return None
     # Law of losses in bursts, the alternative explanation of empty rows.
-    loss_law, found = BurstLossLaw.fit_to_intervals(np.diff(rows)), None
+    loss_law = BurstLossLaw.fit_to_intervals(np.diff(rows))
+    found: SendingRate | None = None
     deciding_rows = rows[0] + np.arange(min(span, ENOUGH))
     arrivals_after_first = int(np.sum(rows <= deciding_rows[-1])) - 1
     # Frequencies in cycles per row.
@@ -128,10 +129,16 @@ def _find_largest_gap(frequency: float, rows: Int[np.ndarray, " arrivals"]) -> t
 
 
 def _fit_periodic_rows(frequency: float, rows: Int[np.ndarray, " arrivals"], middle: float) -> _PeriodicRows:
-    """Return the narrowest line through arrivals' rows near a frequency; each keeps its whole number of periods.
+    """Return the rows of the sender's period near `frequency` that hold all arrivals with the least width of phases.
 
-    Then the width is a convex function of the frequency, and its slope is the distance of the rows of the largest and
-    the least phase: halves that cannot hold its minimum are cut off. `middle`: of the largest gap between phases.
+    The phase of the arrival in row r is f r - k, with k the number of its period at the given frequency, which is kept.
+    Then the width max(phase) - min(phase) is a convex function of f. Its slope is the distance between the rows of the
+    largest and the least phase, so bisection finds the minimum.
+
+    Args:
+        frequency: an approximate frequency, in periods per row.
+        rows: rows of the arrivals.
+        middle: phase in the middle of the largest gap between arrivals' phases, where periods are counted from.
     """
     whole_periods = np.floor(frequency * rows - middle)  # of each arrival, counted from the middle of the gap
     low, high = frequency - 1 / np.ptp(rows), frequency + 1 / np.ptp(rows)

@@ -54,14 +54,20 @@ DOUBTS = 3  # that the page shows; `summary.json` has all
 
 
 def make_run_results(health: Health, network: str) -> ResultsContent:
-    """Return the content of the results folder; `network` is the user's name of the network."""
+    """Return the content of a run's results folder: figures, page and summary.
+
+    `health`: the record of the run with its diagnosis. `network`: the user's name of the network.
+    """
     return ResultsContent(
         run_figures(health), partial(run_page, health, network), run_summary(health), lambda folder: None
     )
 
 
 def make_results_of_plants(examined: Mapping[str, Health], network: str) -> ResultsContent:
-    """Return the results of several plants: an overview, with the most doubted plants first, and a folder for each."""
+    """Return the results of several plants: an overview, with the most doubted plants first, and a folder for each.
+
+    `examined`: the diagnosis of each plant's run, by the plant's name. `network`: the user's name of the network.
+    """
     folders = {plant: f"plant.{quote(plant, safe='')}" for plant in examined}
 
     def write(folder: Path) -> None:
@@ -126,23 +132,23 @@ def run_figures(health: Health) -> dict[str, Figure]:
 
 
 def _name_position_map(kind: str) -> str:
-    """Return the name of the map of filtered or of smoothed estimates."""
+    """Return the file name of the map of estimates of a kind: "map" for "estimates", "map_smoothed" for "smoothed"."""
     return "map" if kind == "estimates" else f"map_{kind}"
 
 
 def _collect_estimates(health: Health) -> list[tuple[str, Record]]:
-    """Return ("estimates", record), and ("smoothed", smoothed record) if there is one."""
-    later = health.record.smoothed
-    return [("estimates", health.record)] + ([] if later is None else [("smoothed", later)])
+    """Return the records to draw with their kinds: ("estimates", record), and ("smoothed", record) if there is one."""
+    smoothed = health.record.smoothed
+    return [("estimates", health.record)] + ([] if smoothed is None else [("smoothed", smoothed)])
 
 
 def _choose_nodes_to_draw(record: Record) -> list[str]:
-    """Return the nodes that are drawn, the fused estimate first."""
+    """Return the first MOST of the nodes that have estimates, the fusion centre first."""
     return _sort_nodes(record)[:MOST]
 
 
 def _sort_nodes(record: Record) -> list[str]:
-    """Return the nodes that have estimates, the fused estimate first."""
+    """Return the nodes that have estimates, the fusion centre (Network.FUSED) first."""
     nodes = [node for node, filters in record.estimates.items() if filters]
     return sorted(nodes, key=lambda node: node != Network.FUSED)
 
@@ -232,9 +238,9 @@ def limit_size_of_drawings(drawings: Mapping[str, bytes], limit: int) -> dict[st
 
 
 def _make_headline(health: Health) -> str:
-    """Return the title of a run's page: the last estimate of the filter that the network relies on.
+    """Return the title of a run's page: the last estimate by the first filter that the network relies on.
 
-    Its first two states, or its position, with bands where it claims a covariance.
+    It has the first two states, or those of a position, each with a band if the filter claims a covariance.
     """
     record = health.record
     nodes = _choose_nodes_to_draw(record)
@@ -286,7 +292,7 @@ def _list_pictures(health: Health, drawings: Mapping[str, bytes]) -> list[Pictur
 
 
 def make_errors_table(record: Record) -> list[Table]:
-    """Return the table of each filter's errors; none where the recording has no true state."""
+    """Return the table of each filter's errors (RMSE by state, and NEES); [] if the recording has no true states."""
 
     def show(value: float, error: float) -> str:
         """Return a number to the digits of its standard error, or a dash where no truth is known."""
@@ -307,7 +313,7 @@ def make_errors_table(record: Record) -> list[Table]:
 
 
 def _name_with_unit(state: str, units: Mapping[str, str]) -> str:
-    """Return the name of a state, with its unit in brackets where it has one."""
+    """Return the name of a state, with its unit in brackets if it has one."""
     return f"{state} ({units[state]})" if state in units else state
 
 
@@ -345,7 +351,10 @@ def _list_doubts(doubts: list[str]) -> list[Points | Text]:
 
 
 def _list_baseline_remarks(health: Health) -> list[Text | Points]:
-    """Return the doubts about baselines, filters for comparison; they are no doubts about the network."""
+    """Return a text and the doubts about filters that are there for comparison only; [] if there are none.
+
+    They are no doubts about the network, which does not rely on these filters.
+    """
     lines = [visible(line) for line in health.remarks()]
     text = "Of filters that are there to be compared with, on which the network does not rely:"
     return [Text([text]), Points(lines)] if lines else []

@@ -12,7 +12,7 @@ from heliograph.planning.sensor_worth import SensorWorth
 from heliograph.report.figures import BLUE, GREEN, INK, STYLE, VERMILION, make_stacked_panels
 
 BAR = 0.6  # height of a bar
-NARROW = 4.0  # between the ends of an axis, below which 1, 2, 5, 10, ... would be one tick or two
+NARROW = 4.0  # ratio of an axis's ends below which 1, 2, 5, 10, ... would give only one or two ticks
 SPARE, ROOM = 0.05, 0.2  # share of the axis left free before all bars, and behind them for numbers
 
 
