@@ -26,10 +26,10 @@ TABLES = {
 
 @dataclass(frozen=True)
 class MapPlaces:
-    """Places for which the designed error is mapped: a grid of x and y, and the network for each place.
+    """Places over which the error of a design is mapped: a grid of x and y, and a network for each place.
 
     Attributes:
-        build: function of the user's Python file: from x and y the network whose node is at that place.
+        build: function of the user's Python file that returns the network for a place (x, y).
         x, y: coordinates of the grid, in the units of this function.
     """
 

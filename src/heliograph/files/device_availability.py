@@ -131,7 +131,8 @@ class DeviceStatuses:
         if not conditions:
             return False
         # The statuses of a topic are one bit for each condition. They are stored when they have changed.
-        content, bits_before = _decode_payload(payload, where), self._encode_statuses_as_bits(topic)
+        content = _decode_payload(payload, where)
+        bits_before = self._encode_statuses_as_bits(topic)
         for condition in conditions:
             self._note_status(condition, topic, offline=content != "" and condition.says_offline(content, where))
         if self._encode_statuses_as_bits(topic) != bits_before:

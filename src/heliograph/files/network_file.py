@@ -32,7 +32,8 @@ def load_network(reference: str) -> Network:
         ValueError: no such module, an error inside it (with its type, message and line), no network, or several and no
             name. One line that names the module.
     """
-    return load_module(reference)[0]
+    network, _names_of_module = load_module(reference)
+    return network
 
 
 def load_module(reference: str) -> tuple[Network, Mapping[str, object]]:

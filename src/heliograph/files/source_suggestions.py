@@ -30,7 +30,8 @@ def suggest_sources(topics: Mapping[str, TopicStatistics], names: Mapping[str, S
         lines.append(f"    {name!r}: {source},{_comment_on_unit(topic, fields[0])}")
         others = [f"{path}{_comment_on_unit(topic, path, '')}" for path in fields[1:FEW]]
         more = ", ".join(others) + (", ..." if len(fields) > FEW else "")
-        lines += [f"    #   or {more}"] if more else []
+        if more:
+            lines.append(f"    #   or {more}")
     return "\n".join([*lines, "}"])
 
 

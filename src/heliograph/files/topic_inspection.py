@@ -164,7 +164,8 @@ def inspect_log(path: Path, dbc: Path | None) -> tuple[dict[str, TopicStatistics
         if name not in topics:
             units = log.units.get(name, {})
             known = {signal: unit for signal, unit in units.items() if unit}
-            kind, bits = log.kinds.get(name, "CAN, not described"), log.bits.get(name, {})
+            kind = log.kinds.get(name, "CAN, not described")
+            bits = log.bits.get(name, {})
             topics[name] = TopicStatistics(kind, list(units), measured_in=known, bits=bits)
         topics[name].logged.append(parse_arrival(message.arrival, message.where))
     # Frames without a database have identifiers alone.

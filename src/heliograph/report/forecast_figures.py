@@ -44,7 +44,9 @@ def draw_forecasts(
     for number, name in enumerate(names):
         if name not in forecasts:
             continue
-        forecast, estimate, colour = forecasts[name], record.estimates[node][name], COLOURS[number % len(COLOURS)]
+        forecast = forecasts[name]
+        estimate = record.estimates[node][name]
+        colour = COLOURS[number % len(COLOURS)]
         time = np.concatenate([record.time[-1:], forecast.time])
         for i, panel in enumerate(panels):
             # The curve begins at the last estimate of state i.
@@ -54,8 +56,9 @@ def draw_forecasts(
             band = sigmas * np.append(last_deviation, forecast.states.deviation[:, i])
             panel.plot(time, mean, color=colour, linestyle=(0, (4, 1.5)))  # dashed
             panel.fill_between(time, mean - band, mean + band, color=colour, alpha=0.2, linewidth=0)
-    for panel in panels if forecasts else ():
-        panel.axvline(record.time[-1], color=MUTED, linewidth=1.0)
+    if forecasts:
+        for panel in panels:
+            panel.axvline(record.time[-1], color=MUTED, linewidth=1.0)
 
 
 def make_forecast_tables(record: Record, forecasts: Forecasts) -> list[Table | Text]:

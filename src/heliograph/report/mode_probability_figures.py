@@ -28,7 +28,7 @@ def draw_modes_of_nodes(record: Record, kind: str, nodes: Sequence[str]) -> dict
 @matplotlib.rc_context(LOOK)
 def _draw_modes(record: Record, node: str) -> Figure:
     """Draw the probabilities of the modes over time, by the filters of one node."""
-    figure, grid = make_stacked_panels(1, 2.2, 0.8)
+    figure, grid = make_stacked_panels(1, height=2.2, margin=0.8)
     record.plot_modes(node, axes=grid[0])
     place_legend_above(figure, grid[0], columns=3)
     label_time_axis(record, grid[0])

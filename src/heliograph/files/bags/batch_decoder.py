@@ -62,7 +62,8 @@ class MessageLayout:
         field has no fixed position.
         """
         self._definitions, self._data, self._paths = definitions, data, paths
-        self.lengths, self.fields = dict[int, int](), dict[str, tuple[int, str]]()
+        self.lengths = dict[int, int]()
+        self.fields = dict[str, tuple[int, str]]()
         self._note_length(0)
         end = self._locate_message_numbers(begin=4, kind=kind, prefix="")
         has_padding_alone_behind = 0 <= len(data) - end < 4  # a message is filled up to a multiple of four bytes
@@ -176,7 +177,9 @@ class BatchDecoder:
 
     def __init__(self, reader: "AnyReader", sources: TopicReader):
         """Hold the bag's definitions of messages and the network's sources; no layout of a message is known yet."""
-        self._definitions, self._sources, self._is_ros2 = reader.typestore.fielddefs, sources, reader.is2
+        self._definitions = reader.typestore.fielddefs
+        self._sources = sources
+        self._is_ros2 = reader.is2
         self._layouts = defaultdict[tuple[str, int], list[MessageLayout]](list)
         self.marked = Counter[str]()  # by topic: messages that say that something read of them has no value
 
@@ -223,7 +226,8 @@ class BatchDecoder:
             groups[message.connection.topic, len(message.data)].append(i)
         if FEWEST * len(groups) > len(batch):  # too few of a kind to be worth it
             raise LayoutNotFixedError
-        results, counts = defaultdict[str, list[NodeReadings]](list), Counter[str]()
+        results = defaultdict[str, list[NodeReadings]](list)
+        counts = Counter[str]()
         for (topic, _), members in groups.items():
             # The messages of one topic and size as bytes, (messages, size).
             table = np.frombuffer(b"".join(batch[i].data for i in members), dtype=np.uint8).reshape(len(members), -1)
@@ -244,8 +248,8 @@ class BatchDecoder:
 
         A source whose `valid` is {} ignores such flags.
         """
-        sources = [source for source, *_ in self._sources.of(topic) if source.valid != {}]
-        return {path for source in sources for path in _list_paths_of_numbers(source)}
+        sources = [mapped.source for mapped in self._sources.of(topic)]
+        return {path for source in sources if source.valid != {} for path in _list_paths_of_numbers(source)}
 
     def _yield_rows_by_layout(
         self, connection: "Connection", table: np.ndarray
@@ -263,9 +267,9 @@ class BatchDecoder:
         while len(left):
             # No known layout fits: make one from the first message that is left.
             if index == len(known):
-                paths = {
-                    path for source, *_ in self._sources.of(connection.topic) for path in _list_paths_of_numbers(source)
-                }
+                paths = set[str]()
+                for mapped in self._sources.of(connection.topic):
+                    paths.update(_list_paths_of_numbers(mapped.source))
                 paths |= list_flags(connection.msgtype, self._list_judged_paths(connection.topic))
                 known.append(MessageLayout(self._definitions, connection.msgtype, table[left[0]].tobytes(), paths))
             fits = known[index].fits(table[left])

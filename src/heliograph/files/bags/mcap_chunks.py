@@ -91,7 +91,8 @@ def _yield_messages_of_chunk(
 
     # A chunk is itself a record, whose content begins after the record's head. Unpack the records in it; `decompress`
     # also compares their checksum.
-    stream, chunk_content = storage.bio, chunk.chunk_start_offset + RECORD_HEAD.size
+    stream = storage.bio
+    chunk_content = chunk.chunk_start_offset + RECORD_HEAD.size
     assert stream is not None  # since the file is open
     stream.seek(chunk_content + BYTES_BEFORE_CHECKSUM)
     (checksum,) = CHECKSUM.unpack(stream.read(CHECKSUM.size))

@@ -117,7 +117,9 @@ def _yield_stored_messages(path: Path, file: BinaryIO, sources: TopicReader | No
         ValueError: a topic of the sources in an encoding that is not read.
         Exception: whatever damage leads to.
     """
-    channels, types, count = dict[int, McapChannel](), dict[int, ProtobufType](), 0
+    channels = dict[int, McapChannel]()
+    types = dict[int, ProtobufType]()
+    count = 0
     for kind, content in _read_records(file):
         if kind == SCHEMA:
             types |= _read_protobuf_schemas(content)

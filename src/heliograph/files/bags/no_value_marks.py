@@ -78,7 +78,8 @@ def blank_columns(
     Returns:
         The columns, and a mask (messages,) of the messages in which some field has no value.
     """
-    blank, marked = dict(columns), np.zeros(len(next(iter(columns.values()), ())), dtype=bool)
+    blank = dict(columns)
+    marked = np.zeros(len(next(iter(columns.values()), ())), dtype=bool)
     for mark in MARKS.get(kind, ()):
         for path in filter(mark.covers, judged):
             is_none = mark.is_none(columns[path], *(columns[flag] for flag in mark.flags))

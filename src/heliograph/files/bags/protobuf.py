@@ -94,7 +94,8 @@ class ProtobufSchema:
         for file in _list_values_of_field(data, 1):
             syntax = _read_text_field(file, 12)
             package = _read_text_field(file, 2)
-            prefix, implicit = f"{package}." if package else "", syntax == "proto3"
+            prefix = f"{package}." if package else ""
+            implicit = syntax == "proto3"
             for message_type in _list_values_of_field(file, 4):
                 schema._add_message_type(message_type, prefix, implicit)
             for enumeration in _list_values_of_field(file, 5):
@@ -109,7 +110,8 @@ class ProtobufSchema:
             prefix: full name of what it stands in, with a dot.
             implicit: whether an absent field has its default, as in proto3.
         """
-        name, fields = prefix + _read_text_field(data, 1), dict[int, FieldDescriptor]()
+        name = prefix + _read_text_field(data, 1)
+        fields = dict[int, FieldDescriptor]()
         for content in _list_values_of_field(data, 2):
             # Numbers in the description of a field: 1 name, 3 its number in messages, 4 label, 5 kind, 6 type's name.
             found = {number: value for number, _, value in read_fields(content)}

@@ -85,7 +85,9 @@ def read_bag(
             raise fail(f"{path}", expected, f"only {_join_names(counts)}")
         _check_fields_of_sources(path, reader, sources)
         # Decode the messages of a batch all at once if their layouts allow it, else one after another.
-        total, done, decoder = sum(counts[topic] for topic in used), 0, BatchDecoder(reader, sources)
+        total = sum(counts[topic] for topic in used)
+        done = 0
+        decoder = BatchDecoder(reader, sources)
         marked = Counter[str]()  # by topic: messages that say that something read of them has no value
         try:
             for batch in group_into_batches(read_raw_messages(path, reader, used)):
@@ -188,7 +190,9 @@ def read_raw_messages(path: Path, reader: "AnyReader", topics: list[str]) -> Ite
             raise BagDamagedError(
                 str(fail(f"{path}, {where}", "a bag without damage", _format_reason(error)))
             ) from None
-        topic, kind, last_logged = message.connection.topic, message.connection.msgtype, message.logged
+        topic = message.connection.topic
+        kind = message.connection.msgtype
+        last_logged = message.logged
         if types.setdefault(topic, kind) != kind:
             where = f"{path}, {topic}, logged at {format_moment(last_logged)}"
             raise BagDamagedError(str(fail(where, f"messages of {types[topic]}, as before", kind)))
@@ -273,8 +277,10 @@ def list_fields(reader: "AnyReader", kind: str, prefix: str = "", depth: int = 6
     """
     from rosbags.interfaces import Nodetype
 
+    if depth == 0:
+        return
     _constants, fields = reader.typestore.fielddefs.get(kind, ([], []))
-    for name, (node, field_type) in fields if depth else ():
+    for name, (node, field_type) in fields:
         if node == Nodetype.BASE:
             yield prefix + name, str(field_type[0])
         elif node == Nodetype.NAME:  # a message within this one
@@ -291,8 +297,9 @@ def format_moment(nanoseconds: int) -> str:
 def _check_fields_of_sources(path: Path, reader: "AnyReader", sources: TopicReader) -> None:
     """Raise ValueError if a source maps a field that the message type of its topic does not have."""
     for connection in reader.connections:
-        what, fields = f"{path}, {connection.topic}", dict(list_fields(reader, connection.msgtype))
-        needed = [field for source, *_ in sources.of(connection.topic) for field in source.fields if field]
+        what = f"{path}, {connection.topic}"
+        fields = dict(list_fields(reader, connection.msgtype))
+        needed = [field for mapped in sources.of(connection.topic) for field in mapped.source.fields if field]
         if needed and not fields:
             raise fail(what, "a message type that the bag defines", f"{connection.msgtype!r}, which it does not")
         for field in needed:

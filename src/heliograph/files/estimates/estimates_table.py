@@ -102,7 +102,8 @@ def _make_columns(
         estimate: mean (rows, n) and covariance (rows, n, n); without covariances (claim "none") only means are shown.
         angles: indices of the states that are angles, shown between -pi and pi.
     """
-    mean, covariance = wrap_angles(np.asarray(estimate.mean), angles), np.asarray(estimate.covariance)
+    mean = wrap_angles(np.asarray(estimate.mean), angles)
+    covariance = np.asarray(estimate.covariance)
     if mean.ndim != 2:
         raise fail("record", "the run over one recording", f"estimates of shape {mean.shape}")
     columns = []

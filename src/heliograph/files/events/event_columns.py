@@ -136,7 +136,8 @@ class NodeEvents:
         order = np.lexsort((sequence, time))
         counts, differences = sequence[order], np.diff(sequence[order])
         # Whether the largest number is all ones in fewer bits than were said, and each fall is from it.
-        largest, before_falls = int(counts.max()), counts[:-1][differences < 0]
+        largest = int(counts.max())
+        before_falls = counts[:-1][differences < 0]
         bits = largest.bit_length()
         is_all_ones = largest + 1 == 1 << bits and largest + 1 < self.period
         if is_all_ones and len(before_falls) >= FEWEST_FALLS and np.all(before_falls == largest):
@@ -167,10 +168,11 @@ class NodeEvents:
         arrivals are known, a stamp was not set if it is more than a year away from both neighbours, which are near each
         other.
         """
-        time, arrival, _ = self.arrays()
-        delays, year = arrival - time, YEAR / SECOND if self.numbers else YEAR  # numbers are seconds
+        time, arrival, _sequence = self.arrays()
         if not len(time):
             return UnsetStampNotes()
+        delays = arrival - time
+        year = YEAR / SECOND if self.numbers else YEAR  # numbers are seconds, other times nanoseconds
         if np.median(delays) > year:
             self.arrival = array(self.time.typecode, self.time)
             two_clocks = "stamps and arrivals are of two clocks: each event arrives when it was measured"

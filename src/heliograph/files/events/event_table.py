@@ -165,7 +165,8 @@ class EventTable:
         if strict:
             raise error
         self.refused += 1
-        self.reasons += [str(error)] if len(self.reasons) < 3 else []
+        if len(self.reasons) < 3:
+            self.reasons.append(str(error))
 
     def finish(self, source: str, strict: bool = False) -> None:
         """End the reading of a source: leave out events whose time stamp was not set, and note what was left out.
@@ -198,7 +199,8 @@ class EventTable:
             ValueError: there is such an event, where reading is strict.
         """
         unset = columns.drop_unset_stamps_in_place(name)
-        self.notes += [unset.note] if unset.note else []
+        if unset.note:
+            self.notes.append(unset.note)
         self.notes += columns.describe_doubtful_count(name)
         if unset.reason:
             self.refuse(InputError(unset.reason), strict)
@@ -244,7 +246,9 @@ class EventTable:
 
     def sort_events(self) -> Iterator[Event]:
         """Yield events in order of arrival; times are seconds from the origin, steps, or numbers as they are."""
-        events, matrices, names = self._sort_by_arrival(), self._list_value_matrices(), [*self.network.names, INPUTS]
+        events = self._sort_by_arrival()
+        matrices = self._list_value_matrices()
+        names = [*self.network.names, INPUTS]
         origin, unit = self.origin, self._unit
         # `event_index` counts the node's events. The times are integers, so that their differences are exact.
         for node, time, arrival, sequence, event_index in zip(*(column.tolist() for column in events), strict=True):
@@ -253,8 +257,10 @@ class EventTable:
 
     def lateness(self) -> dict[str, Float[np.ndarray, " events"]]:
         """Return for each node with events how long each took to arrive, in seconds or time's unit, sorted by time."""
+        if self._times_are_steps:  # then nothing is known of arrivals
+            return {}
         lateness, unit = {}, 1 if self.numbers else SECOND
-        for name in () if self._times_are_steps else self.network.names:
+        for name in self.network.names:
             time, arrival, _sequence = self.columns[name].arrays()
             if len(time):
                 lateness[name] = ((arrival - time) / unit)[np.argsort(time, kind="stable")]
@@ -272,7 +278,7 @@ class EventTable:
         laws, unit = {}, 1 if self.numbers else SECOND
         for name, delays in self.lateness().items():
             length = self.step / SECOND if step is None and self.step is not None else step
-            if length is None:
+            if length is None:  # take the median interval; numbers of steps are 1 apart
                 time, _arrival, _sequence = self.columns[name].arrays()
                 intervals = np.diff(np.unique(time))
                 counts_steps = self.numbers and self.steps
@@ -311,7 +317,7 @@ class EventTable:
         return counts
 
     def recording(self, window: float = np.inf, ahead: float = AHEAD) -> Recording:
-        """Return the events that a timeline uses as rows in order of their times; a repeated event counts once.
+        """Return the events that a `live.Timeline` uses as rows in order of time; a repeated event counts once.
 
         If time counts steps, or if nodes share a channel, all events of a time are one row, else each is one. An input
         holds from its event to the next, and is 0 before the first. A row has the inputs of the interval up to it:
@@ -324,7 +330,8 @@ class EventTable:
         Raises:
             ValueError: no events, several plants, steps beyond ten million.
         """
-        return self.rows(window, ahead)[0]
+        recording, _has_message = self.rows(window, ahead)
+        return recording
 
     def rows(self, window: float = np.inf, ahead: float = AHEAD) -> tuple[Recording, Bool[np.ndarray, " rows"]]:
         """Return the recording, and whether each of its rows has a message of a node: other rows have inputs alone.

@@ -36,7 +36,9 @@ def open_frame_log(path: Path, sources: LogSources, wanted: Wanted) -> Log:
     """
     database = {} if sources.dbc is None else read_can_database(sources.dbc)
     notes = list[str]()
-    units, kinds, bits = dict[str, dict[str, str]](), dict[str, str](), dict[str, dict[str, int]]()
+    units = dict[str, dict[str, str]]()
+    kinds = dict[str, str]()
+    bits = dict[str, dict[str, int]]()
     for message in database.values():
         signals = message.signals
         units[message.name] = {signal.name: signal.unit or "" for signal in signals}

@@ -85,7 +85,8 @@ def _read_group(file: "MDF", group: int, indices: dict[str, int]) -> MessageSeri
     time, values = np.zeros(0), dict[str, np.ndarray]()
     for name, index in indices.items():
         signal = file.get(group=group, index=index, ignore_invalidation_bits=True)
-        time, samples = np.asarray(signal.timestamps, dtype=np.float64), np.asarray(signal.samples)
+        time = np.asarray(signal.timestamps, dtype=np.float64)
+        samples = np.asarray(signal.samples)
         if samples.ndim > 1 or samples.dtype.names:
             continue
         column = np.char.decode(samples, errors="replace") if samples.dtype.kind == "S" else samples

@@ -115,7 +115,8 @@ def read_events(
     """
     instance("network", network, Network, "a Network")
     check_progress(progress, "(read, total)")
-    strict, ignore_unknown = flag("strict", strict), flag("ignore_unknown", ignore_unknown)
+    strict = flag("strict", strict)
+    ignore_unknown = flag("ignore_unknown", ignore_unknown)
     checked = None if sources is None else TopicReader(sources, network)
     # By what the recording is: bags and logs, then messages in our own form, or of the sources' topics.
     if isinstance(source, Path) and is_bag(source):
@@ -146,7 +147,8 @@ def _read_bags(path: Path, sources: TopicReader, progress: Progress | None, stri
         if holds_messages(bag):
             topics = _append_messages_by_topic(bag, read_mcap_messages(bag, sources), sources, events, strict)
             missing = [topic for topic in sources.topics if not set("+#") & set(topic) and topic not in topics]
-            events.notes += [f"{bag}: not in the bag: {', '.join(missing)}"] if missing else []
+            if missing:
+                events.notes.append(f"{bag}: not in the bag: {', '.join(missing)}")
         else:
             read_bag(bag, sources, events, progress, strict)
     return events

@@ -97,7 +97,8 @@ class OwnMessageCollector:
                 self.broken = str(error)
                 return
             self.refused += 1
-            self.reasons += [str(error)] if len(self.reasons) < MOST_REASONS else []
+            if len(self.reasons) < MOST_REASONS:
+                self.reasons.append(str(error))
 
     def events(self) -> EventTable:
         """Return the events that were read, with notes for the user on doubtful times and counts of what was refused.
@@ -123,7 +124,9 @@ class OwnMessageCollector:
             table.notes.append(f"{self.source}: times {span}: seconds and milliseconds, or such, in one column")
         if reader.local:
             self._check_local_time(table)
-        table.refused, table.reasons, table.broken = self.refused, self.reasons, self.broken
+        table.refused = self.refused
+        table.reasons = self.reasons
+        table.broken = self.broken
         return table
 
     def _check_local_time(self, table: EventTable) -> None:
@@ -257,8 +260,8 @@ class HeliographMessageReader:
         position = f"{self.source}, header" if self._table else where
         error_type = HeaderError if self._table else InputError
         known = [*OWN, *(name for names in self.components.values() for name in names)]
-        for name in () if self._ignore else row:
-            if name not in known:
+        for name in row:
+            if name not in known and not self._ignore:
                 listed = ", ".join(dict.fromkeys(known))
                 raise error_type(str(fail(position, f"only the columns {listed}", repr(name))))
         for name in (NODE, SEQUENCE, TIME):
@@ -301,7 +304,8 @@ class HeliographMessageReader:
                 self.rounded = cell
         if is_step and not (number >= 0 and number.is_integer()):
             raise fail(name, "a step, a whole number from 0", f"{cell} ({OF_STEPS})")
-        self.least, self.most = min(self.least, number), max(self.most, number)
+        self.least = min(self.least, number)
+        self.most = max(self.most, number)
         return number
 
 
@@ -321,7 +325,9 @@ def _read_event_values(row: Mapping[str, Any], names: Sequence[str], where: str,
             the running count also tells it, and is NaN then.
     """
     if row.get(VALUES) not in (None, ""):
-        cell, column, is_text = row[VALUES], f"{where}, column {VALUES!r}", isinstance(row[VALUES], str)
+        cell = row[VALUES]
+        column = f"{where}, column {VALUES!r}"
+        is_text = isinstance(row[VALUES], str)
         items: list[Any] = cell.replace(";", " ").split() if is_text else _list_cell_items(cell)
         if numbered and len(items) == len(names) - 1:
             items.append("nan" if is_text else np.nan)

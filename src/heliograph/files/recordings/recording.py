@@ -364,16 +364,16 @@ def _warn_of_clock_set_forward(time: np.ndarray, source: str, numbers: np.ndarra
 
 
 def _warn_of_mixed_units(time: np.ndarray, source: str, numbers: np.ndarray) -> None:
-    """Warn if times leap by a factor from one row to the next, as from seconds to milliseconds.
+    """Warn if times jump by a factor from one row to the next, as from seconds to milliseconds.
 
     `numbers` are the numbers of the rows, from 1.
     """
     if time.dtype.kind not in "fiu":
         return
     before, after = time[:-1].astype(float), time[1:].astype(float)
-    leaps = np.flatnonzero(is_mix_of_units(before, after))
-    if len(leaps):
-        row = int(leaps[0]) + 1
+    jumps = np.flatnonzero(is_mix_of_units(before, after))
+    if len(jumps):
+        row = int(jumps[0]) + 1
         warnings.warn(
             f"{source}, row {numbers[row]}, column {TIME!r}: {time[row]:.14g} after {time[row - 1]:.14g}: "
             "seconds and milliseconds, or such, in one column",

@@ -51,12 +51,17 @@ class RecordingBlocks:
         progress: Progress | None = None,
     ):
         """Prepare to read a table in blocks; `strict`: a row that cannot be read is an error, else refused alone."""
-        self._path, self._strict, self._block, self._progress = path, strict, block, progress
+        self._path = path
+        self._strict = strict
+        self._block = block
+        self._progress = progress
         self._reader = RowReader(network, str(path), strict, ignore_unknown)
         self._last_number = 0  # of the rows read so far, refused ones included
         self._done, self._total = 0, 0  # how much of the file is read, and of how much, as progress has it
-        # Rows refused, with the first reasons; rows yielded; warnings.
-        self.refused, self.reasons, self.rows, self.doubts = 0, list[InputError](), 0, list[str]()
+        self.refused = 0  # how many rows
+        self.reasons = list[InputError]()  # of the first of them
+        self.rows = 0  # that were yielded
+        self.doubts = list[str]()  # warnings
 
     @property
     def notes(self) -> list[str]:

@@ -67,7 +67,8 @@ def read_cells(columns: Mapping[str, np.ndarray], network: Network, refusals: Ro
     received = list_received_columns(network)
     # A relay may have no columns at all: the filters of other nodes do not need what the relay received, so that only
     # its own filter has no data.
-    for name in () if network.relays is None else network.relays.relays:
+    relays = () if network.relays is None else network.relays.relays
+    for name in relays:
         if not any(column in columns for names in received[name] for column in names):
             del received[name]
     if TIME in inputs:

@@ -33,7 +33,8 @@ class RecordingRows(NamedTuple):
 
 def join_recording_rows(parts: Sequence[RecordingRows]) -> RecordingRows:
     """Return the rows of several parts of a table, one after the other."""
-    numbers, time = np.concatenate([part.numbers for part in parts]), np.concatenate([part.time for part in parts])
+    numbers = np.concatenate([part.numbers for part in parts])
+    time = np.concatenate([part.time for part in parts])
     # The fields after numbers and time are dictionaries of columns by name.
     columns = (
         {name: np.concatenate([part[i][name] for part in parts]) for name in parts[0][i]}

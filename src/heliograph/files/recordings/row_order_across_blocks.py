@@ -59,7 +59,8 @@ class BlockOrderCheck:
         """
         # All blocks must have times of one kind (numbers or dates).
         if self.last is not None and self.last.time.dtype != ordered.time.dtype:
-            where, before = f"{self._path}, row {ordered.numbers[0]}, column {TIME!r}", self.last.time.dtype
+            where = f"{self._path}, row {ordered.numbers[0]}, column {TIME!r}"
+            before = self.last.time.dtype
             raise RowsNotInBlocksError(str(fail(where, f"numbers of the kind before, {before}", ordered.time.dtype)))
         # The block must not begin before the last row of the block before it.
         rows = ordered if self.last is None else _join_times(self.last, ordered)

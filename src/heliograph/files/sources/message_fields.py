@@ -8,7 +8,7 @@ from decimal import Decimal
 from functools import lru_cache
 from math import isfinite
 from operator import attrgetter
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -42,6 +42,13 @@ class LongDecimal(float):
         self.decimal = Decimal(text)
 
 
+class _DoubledField(NamedTuple):
+    """An object of JSON in which a field occurs twice, as a dictionary, and the field's name."""
+
+    fields: dict[str, Any]
+    name: str
+
+
 class MissingFieldError(InputError):
     """A message has no field at a path."""
 
@@ -56,7 +63,7 @@ def decode_json(text: str | bytes, name: str) -> Any:
     """
     content, doubled = _decode_json(text, name)
     if doubled:
-        raise fail_of_doubled(name, doubled[0][1])
+        raise fail_of_doubled(name, doubled[0].name)
     return content
 
 
@@ -78,20 +85,20 @@ def fail_of_doubled(name: str, field: str) -> InputError:
     return fail(name, "distinct fields", f"{field!r} more than once")
 
 
-def _decode_json(text: str | bytes, name: str) -> tuple[Any, list[tuple[dict[str, Any], str]]]:
+def _decode_json(text: str | bytes, name: str) -> tuple[Any, list[_DoubledField]]:
     """Return the content of JSON, and each object in it that has a field twice, with the field's name.
 
     Decoders keep the last of two fields of one name without a word, so the caller refuses such an object. `name`: of
     the text, for errors. Words such as nan or inf, which are no JSON, are read as null.
     """
-    doubled: list[tuple[dict[str, Any], str]] = []
+    doubled = list[_DoubledField]()
 
     def collect(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        """Return an object's fields as a dictionary; if one occurs twice, append (fields, its name) to `doubled`."""
+        """Return an object's fields as a dictionary; if one occurs twice, append the object to `doubled`."""
         fields = dict(pairs)
         if len(fields) < len(pairs):
             names = [name for name, _ in pairs]
-            doubled.append((fields, next(name for name in names if names.count(name) > 1)))
+            doubled.append(_DoubledField(fields, next(name for name in names if names.count(name) > 1)))
         return fields
 
     # First as it is, which is fast; then once more with null for words such as nan outside of quoted texts.
@@ -109,24 +116,28 @@ def _decode_json(text: str | bytes, name: str) -> tuple[Any, list[tuple[dict[str
         raise fail(name, "JSON", show_value(text)) from None
 
 
-def _name_doubled_field(content: Any, doubled: list[tuple[dict[str, Any], str]]) -> str | None:
+def _name_doubled_field(content: Any, doubled: list[_DoubledField]) -> str | None:
     """Return the name of a field that occurs twice in `content` or in an object inside it, or None.
 
-    `doubled` holds the pairs (object, name of its doubled field) that were found while decoding.
+    `doubled` holds the objects with such a field that were found while decoding.
     """
     if not doubled or not isinstance(content, dict | list):
         return None
-    field_of_content = next((field for fields, field in doubled if fields is content), None)
-    if field_of_content is not None:
-        return field_of_content
+    for field in doubled:
+        if field.fields is content:
+            return field.name
     items = content.values() if isinstance(content, dict) else content
-    return next((field for item in items if (field := _name_doubled_field(item, doubled)) is not None), None)
+    names = (_name_doubled_field(item, doubled) for item in items)
+    return next((name for name in names if name is not None), None)
 
 
 def _flatten_lists(content: object) -> Iterator[object]:
     """Yield the items of a list, and of lists inside it, one by one; anything but a list is yielded itself."""
-    for item in content if isinstance(content, list) else [content]:
-        yield from _flatten_lists(item) if isinstance(item, list) else [item]
+    if not isinstance(content, list):
+        yield content
+        return
+    for item in content:
+        yield from _flatten_lists(item)
 
 
 def match_topic(topic: str, pattern: str) -> bool:

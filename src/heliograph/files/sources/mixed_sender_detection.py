@@ -32,7 +32,9 @@ class SenderCounter:
         senders apart already, or they are values.
         """
         self._noted += 1
-        for name, value in message.items() if isinstance(message, Mapping) else ():
+        if not isinstance(message, Mapping):
+            return
+        for name, value in message.items():
             if isinstance(value, str | int) and name not in asked and self._is_sender_name(name):
                 counts = self._counts[topic, plant, node, name]
                 if len(counts) <= MANY:

@@ -98,7 +98,8 @@ class Stamp:
 
         `unit`: of a numeric time. `where`: the message's place, for errors. `quoted`: whether the time may be a text.
         """
-        value, name = field_at(message, self.path, where), f"{where}, field {self.path!r}"
+        value = field_at(message, self.path, where)
+        name = f"{where}, field {self.path!r}"
         if self.start is not None and isinstance(value, str) and looks_like_date(value):
             raise fail(name, f"a number, which counts from start={self.start!r}", show_value(value))
         return convert_time(value, unit, name, quoted) + self.shift
@@ -372,7 +373,8 @@ def _read_valid_flags(valid: object) -> Flags:
         return None if valid is None else {valid: (True, 1)}
     if not isinstance(valid, Mapping):
         raise fail("json_field, valid", "a dotted path, or a dictionary of paths with their values", show_value(valid))
-    return _split_conditions(valid)[0]  # those on fields of the message
+    allowed_by_path, _available = _split_conditions(valid)
+    return allowed_by_path
 
 
 def _broadcast_to_paths(name: str, value: ArrayLike, paths: tuple[Path, ...], neutral: float) -> tuple[float, ...]:

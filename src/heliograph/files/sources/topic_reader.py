@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Collection, Mapping
+from typing import NamedTuple
 
 import numpy as np
 
@@ -30,6 +31,14 @@ LISTED = 8  # topics in one line
 COPY = 10 * SECOND  # a message that comes again so soon, with its count and values, is a copy
 
 
+class _LastReading(NamedTuple):
+    """The newest reading of a node, when it came (nanoseconds since 1970), and whether its count has ever changed."""
+
+    reading: Reading
+    moment: int
+    has_count_changed: bool
+
+
 class TopicReader:
     """Reads messages of topics by the sources of a network, as readings of nodes; unknown topics are counted.
 
@@ -52,12 +61,12 @@ class TopicReader:
         self.stored = 0  # a broker's stored messages without a time: they arrive on subscribing, so have no date
         self.excluded = Counter[str]()  # messages that a condition leaves out, by topic
         self.offline = Counter[str]()  # messages of devices that had said that they are offline, by topic
-        # By pattern of topics and path of a field: the error of the first message without it, and those that came.
-        self.absent, self.found = dict[tuple[str, str], str](), set[tuple[str, str]]()
-        # By plant and node: the newest reading, its moment, and whether its count ever differed from the one before.
-        self._last = dict[tuple[str, str], tuple[Reading, int, bool]]()
+        # {(pattern of topics, path of a field): error of the first message without it}, and the pairs that came.
+        self.absent = dict[tuple[str, str], str]()
+        self.found = set[tuple[str, str]]()
+        self._last = dict[tuple[str, str], _LastReading]()  # by plant and node
+        # What the network expects: time in steps or not, and for each node, and the inputs, the names of its numbers.
         self.time_counts_steps = TIME_STEP not in network.inputs
-        # By node, and of the inputs: the names of its numbers.
         self.names = {name: tuple(network.nodes[name].received_names) for name in network.names}
         self.names[INPUTS] = tuple(name for name in network.inputs if name != TIME_STEP)
         if not isinstance(table, Mapping):
@@ -65,16 +74,21 @@ class TopicReader:
         self._table = {
             topic: map_sources(topic, items, self.names, self.time_counts_steps) for topic, items in table.items()
         }
-        # By topic that came, found when first asked for: its sources, and the fields that they use.
+        # By topic that came, kept when first asked for: its sources, and the fields that they use.
         self._sources_of_topic = dict[str, list[MappedSource]]()
         self._fields_of_topic = dict[str, set[str]]()
-        mapped = [single for several in self._table.values() for single in several]
-        self.device_statuses = DeviceStatuses(condition for single in mapped for condition in single.source.available)
-        # Where dates are counted in steps: the seconds of one.
-        step_lengths = {single.source.step for single in mapped}
+        sources = [mapped.source for mapped in self._mapped_sources]
+        self.device_statuses = DeviceStatuses(condition for source in sources for condition in source.available)
+        # The seconds of a step, if dates are counted in steps.
+        step_lengths = {source.step for source in sources}
         if len(step_lengths) > 1:
             raise fail("sources, step", "the same of all", sorted(map(str, step_lengths)))
         self.step_seconds = next(iter(step_lengths), None)
+
+    @property
+    def _mapped_sources(self) -> list[MappedSource]:
+        """Return the sources of all topics."""
+        return [mapped for of_topic in self._table.values() for mapped in of_topic]
 
     @property
     def topics(self) -> list[str]:
@@ -102,28 +116,31 @@ class TopicReader:
     @property
     def periods(self) -> dict[str, int]:
         """Return {node: after how many messages its running count begins again at 0}; other nodes are absent."""
-        mapped = [single for several in self._table.values() for single in several]
-        counts = [(node, single.source.sequence) for single in mapped for node in single.indices_by_node]
+        counts = [(node, mapped.source.sequence) for mapped in self._mapped_sources for node in mapped.indices_by_node]
         return {node: count.period for node, count in counts if count is not None and count.period}
 
     @property
     def nodes_without_count(self) -> set[str]:
         """Return the nodes whose messages carry no running count, so that lost messages are not known."""
-        mapped = [single for several in self._table.values() for single in several]
-        counted = {node for single in mapped for node in single.indices_by_node if single.source.sequence is not None}
-        return {node for single in mapped for node in single.indices_by_node} - counted
+        nodes, counted = set[str](), set[str]()
+        for mapped in self._mapped_sources:
+            nodes |= mapped.indices_by_node.keys()
+            if mapped.source.sequence is not None:
+                counted |= mapped.indices_by_node.keys()
+        return nodes - counted
 
     @property
     def columns(self) -> set[str]:
         """Return the columns of a table that the sources read: paths of their fields, and the paths' first words."""
-        mapped = [single.source for several in self._table.values() for single in several]
-        return {name for source in mapped for path in source.fields for name in (path, path.split(".")[0])}
+        paths = [path for mapped in self._mapped_sources for path in mapped.source.fields]
+        return {name for path in paths for name in (path, path.split(".")[0])}
 
     def list_fields(self, topic: str) -> set[str]:
         """Return the top-level fields of a topic's messages that sources use: the first words of their paths."""
         if topic not in self._fields_of_topic:
             fields = self._fields_of_topic.setdefault(topic, set())
-            for source, *_ in self.of(topic):
+            for mapped in self.of(topic):
+                source = mapped.source
                 names = [name.path for name in (source.plant, source.node) if isinstance(name, Field)]
                 values = [
                     field for path in source.paths for field in ((path,) if isinstance(path, str) else path.parts)
@@ -149,14 +166,16 @@ class TopicReader:
             where: place of the message, for errors.
         """
         sources, results = self.of(topic), list[Reading | Unread]()
-        self.unknown[topic] += not sources
+        if not sources:
+            self.unknown[topic] += 1
         for mapped in sources:
             try:
                 reading = self._read_by_source(mapped, topic, message, where)
             except InputError as error:
                 results.append(Unread(error, self._read_without_values(mapped, topic, message, where, error)))
             else:
-                results += [] if reading is None else [reading]
+                if reading is not None:
+                    results.append(reading)
         return results
 
     def date_copy_as_original(self, reading: Reading, arrival: int | None) -> Reading:
@@ -174,12 +193,17 @@ class TopicReader:
         if reading.sequence is None or reading.time is None or moment is None or has_no_seconds:
             return reading
         key = reading.plant, reading.node
-        # The node's last reading, when it came, and whether its count has ever changed. Before the first, no copy fits.
-        before, moment_before, count_moved = self._last.get(key, (reading, -COPY - 1, False))
-        may_be_copy = reading.sequence == before.sequence and count_moved and 0 <= moment - moment_before <= COPY
-        if may_be_copy and np.array_equal(reading.values, before.values, equal_nan=True):
-            return reading._replace(time=before.time)
-        self._last[key] = reading, moment, count_moved or reading.sequence != before.sequence
+        last = self._last.get(key)
+        if last is None:
+            self._last[key] = _LastReading(reading, moment, has_count_changed=False)
+            return reading
+        is_count_repeated = reading.sequence == last.reading.sequence and last.has_count_changed
+        comes_soon_after = 0 <= moment - last.moment <= COPY
+        has_same_values = np.array_equal(reading.values, last.reading.values, equal_nan=True)
+        if is_count_repeated and comes_soon_after and has_same_values:
+            return reading._replace(time=last.reading.time)
+        has_changed = last.has_count_changed or reading.sequence != last.reading.sequence
+        self._last[key] = _LastReading(reading, moment, has_changed)
         return reading
 
     def describe_absent_field(self) -> str:

@@ -4,7 +4,7 @@ import os
 import re
 from dataclasses import dataclass, field, replace
 from typing import Literal, cast
-from urllib.parse import unquote, urlsplit, urlunsplit
+from urllib.parse import SplitResult, unquote, urlsplit, urlunsplit
 
 SHAPE = "influx://HOST:PORT/DATABASE or postgresql://HOST/DATABASE, with ?table=NAME or ?query=SELECT..."
 INFLUX, POSTGRES = ("influx", "influxs"), ("postgresql",)
@@ -86,18 +86,10 @@ def parse_store(url: str) -> StoreAddress:
     text("store", url)
     # "scheme://.../database?options&", then "query", "flux" or "sql" and the statement; these are "" if there is none.
     location, language, statement = [*ASKS.split(url, maxsplit=1), "", ""][:3]
-    try:
-        parts = urlsplit(location)
-        host, _ = parts.hostname, parts.port  # `port` is read because it raises at one that is no number
-    except ValueError:
-        raise fail("store", ESCAPED if "@" in location else SHAPE, "an address that cannot be read") from None
-    if "@" in parts.path:  # the first / ends the host, so that what stands before it is none
-        raise fail("store", ESCAPED, "an address with an @ behind its first /")
+    parts = _split_location(location)
     database = unquote(parts.path).strip("/")
     is_influx = parts.scheme in INFLUX
-    if parts.scheme not in (*INFLUX, *POSTGRES) or not database or (is_influx and not host):
-        raise fail("store", SHAPE, f"{parts.scheme}://{host or ''}{parts.path}")
-    store = f"store {parts.scheme}://{host or ''}/{database}"
+    store = f"store {parts.scheme}://{parts.hostname or ''}/{database}"  # for errors
     # The options before the statement. A URL has one table or one statement, in a language that the server has.
     table, organisation = _read_options(store, parts.query, is_influx, has_statement=bool(language))
     if language and not statement.strip():
@@ -115,6 +107,28 @@ def parse_store(url: str) -> StoreAddress:
         language=cast(Language, language or "query"),
         organisation=organisation,
     )
+
+
+def _split_location(location: str) -> SplitResult:
+    """Return the parts of a store's URL without its statement: scheme, host, path (the database) and options (`query`).
+
+    Raises:
+        ValueError: another scheme, no database, no host of InfluxDB, an @ or / of a password that is not escaped.
+    """
+    from heliograph.numerics.check import fail
+
+    try:
+        parts = urlsplit(location)
+        host, _port = parts.hostname, parts.port  # reading `port` raises ValueError if it is no number
+    except ValueError:
+        raise fail("store", ESCAPED if "@" in location else SHAPE, "an address that cannot be read") from None
+    if "@" in parts.path:  # the first / ends the host: the / belongs to a user or a password
+        raise fail("store", ESCAPED, "an address with an @ behind its first /")
+    has_database = bool(unquote(parts.path).strip("/"))
+    lacks_host = parts.scheme in INFLUX and not host
+    if parts.scheme not in (*INFLUX, *POSTGRES) or not has_database or lacks_host:
+        raise fail("store", SHAPE, f"{parts.scheme}://{host or ''}{parts.path}")
+    return parts
 
 
 def _read_options(store: str, options: str, is_influx: bool, has_statement: bool) -> tuple[str, str]:

@@ -36,8 +36,10 @@ def read_csv_blocks(
     """
     text = CsvReader(str(path), path, marked=False)  # splits lines into cells
     columns = CsvColumnReader(str(path), path, only, strict)  # makes columns of the cells
-    blocks = read_line_blocks(path, size, progress)
-    for lines in blocks if strict else yield_until_cut_off(blocks):
+    blocks: Iterator[bytes | CutOffError] = read_line_blocks(path, size, progress)
+    if not strict:  # a file that was cut off is read up to there, and the error comes last
+        blocks = yield_until_cut_off(blocks)
+    for lines in blocks:
         if isinstance(lines, CutOffError):
             yield columns.read([lines])
         else:
@@ -84,7 +86,10 @@ class CsvColumnReader:
 
         `only`: the columns to read, None for all. `strict`: whether a row that cannot be read is an error.
         """
-        self.source, self.path, self._only, self._strict = source, path, only, strict
+        self.source = source
+        self.path = path
+        self._only = only
+        self._strict = strict
         self.header: list[str] = []
         self._dated = dict[str, bool]()  # for each column whether it holds dates, as soon as a cell tells it
         self._zoned = dict[str, bool]()  # for each column of dates whether these have a time zone
@@ -100,7 +105,9 @@ class CsvColumnReader:
         """
         refused = list[InputError]()
         # Of each row that can be read: its number in the file, its cells, and these as numbers.
-        numbers, texts, values = list[int](), list[list[str]](), list[list[float | int]]()
+        numbers = list[int]()
+        texts = list[list[str]]()
+        values = list[list[float | int]]()
         for row in rows:
             try:
                 if isinstance(row, InputError):

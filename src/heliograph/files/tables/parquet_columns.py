@@ -98,9 +98,10 @@ def _convert_column(column: "pa.ChunkedArray[Any]", where: str, name: str, first
         return convert_integers_of_arrow(column)
     if pa.types.is_decimal(kind):
         values = column.to_pylist()
-        whole = kind.scale <= 0 and all(value is None or abs(value) < 2**63 for value in values)
-        if whole:
-            return convert_integers_of_arrow(pa.chunked_array([pa.array([v and int(v) for v in values], pa.int64())]))
+        are_integers = kind.scale <= 0 and all(value is None or abs(value) < 2**63 for value in values)
+        if are_integers:
+            integers = [None if value is None else int(value) for value in values]
+            return convert_integers_of_arrow(pa.chunked_array([pa.array(integers, pa.int64())]))
         return np.array([np.nan if value is None else float(value) for value in values], dtype=np.float64)
     # All other numbers; a column without values (null) is NaN.
     if not (pa.types.is_null(kind) or (pa.types.is_primitive(kind) and not pa.types.is_temporal(kind))):

@@ -92,25 +92,11 @@ def _convert_column(values: Any, name: str) -> np.ndarray:
     Tables may be pandas, Arrow, NumPy or plain lists; each kind marks missing values in its own way. Whole numbers keep
     all digits, also those that doubles do not have. `name`: of the column, for errors.
     """
-    # Numbers of pandas, with a mask of missing values; integers of Arrow; masked integers of NumPy.
-    if hasattr(values, "isna") and values.dtype.kind in "iufb":
-        kind = {"i": np.int64, "u": np.uint64, "b": np.bool_}.get(values.dtype.kind, np.float64)
-        absent = np.asarray(values.isna(), dtype=bool)
-        return convert_to_numbers(values.to_numpy(dtype=kind, na_value=kind(0)), absent)
-    if hasattr(values, "null_count") and hasattr(values, "chunks") and str(values.type).startswith(("int", "uint")):
-        return convert_integers_of_arrow(values)
-    if isinstance(values, np.ma.MaskedArray) and values.dtype.kind in "iu":
-        return convert_to_numbers(np.asarray(values), np.ma.getmaskarray(values))
-    # All others as a NumPy array. Integers that doubles cannot hold keep their digits also in a list of mixed numbers.
-    if hasattr(values, "to_numpy"):
-        column = values.to_numpy()
-    else:
-        is_of_objects = type(values) is np.ndarray and values.dtype.kind == "O"
-        column = values if is_of_objects else np.asarray(fill_masked(values))
-        is_list_of_floats = isinstance(values, list | tuple) and column.dtype.kind == "f"
-        if is_list_of_floats and np.nanmax(np.abs(column), initial=0) >= EXACT:
-            column = np.array(values, dtype=object)
+    numbers = _convert_masked_numbers(values)
+    if numbers is not None:
+        return numbers
     # Convert by the type of the array: dates, numbers, or objects one by one.
+    column = _make_array(values)
     if column.ndim != 1:
         raise fail(name, "one number or date in each row", f"shape {column.shape}")
     if column.dtype.kind == "M":
@@ -120,6 +106,36 @@ def _convert_column(values: Any, name: str) -> np.ndarray:
     if column.dtype.kind in "OUT":
         return _convert_object_column(column, name)
     raise fail(name, "numbers or dates", f"{column.dtype}")
+
+
+def _convert_masked_numbers(values: Any) -> np.ndarray | None:
+    """Return the numbers of a column that has a mask of missing values beside them; None for any other column.
+
+    Such are numbers of pandas, integers of Arrow and masked integers of NumPy. Missing numbers become NaN (MISSING in a
+    column of int64).
+    """
+    if hasattr(values, "isna") and values.dtype.kind in "iufb":  # pandas
+        kind = {"i": np.int64, "u": np.uint64, "b": np.bool_}.get(values.dtype.kind, np.float64)
+        absent = np.asarray(values.isna(), dtype=bool)
+        return convert_to_numbers(values.to_numpy(dtype=kind, na_value=kind(0)), absent)
+    if hasattr(values, "null_count") and hasattr(values, "chunks") and str(values.type).startswith(("int", "uint")):
+        return convert_integers_of_arrow(values)
+    if isinstance(values, np.ma.MaskedArray) and values.dtype.kind in "iu":
+        return convert_to_numbers(np.asarray(values), np.ma.getmaskarray(values))
+    return None
+
+
+def _make_array(values: Any) -> np.ndarray:
+    """Return a column as a NumPy array; of objects if it is a list with integers that doubles cannot hold."""
+    if hasattr(values, "to_numpy"):
+        return np.asarray(values.to_numpy())
+    if type(values) is np.ndarray and values.dtype.kind == "O":
+        return values
+    column = np.asarray(fill_masked(values))
+    is_list_of_floats = isinstance(values, list | tuple) and column.dtype.kind == "f"
+    if is_list_of_floats and np.nanmax(np.abs(column), initial=0) >= EXACT:
+        return np.array(values, dtype=object)
+    return column
 
 
 def _convert_object_column(column: np.ndarray, name: str) -> np.ndarray:

@@ -91,7 +91,8 @@ class TextStream:
                 results += self._unpack.decompress(packed, AT_ONCE)
                 packed = self._unpack.unconsumed_tail
                 if self._unpack.eof:  # another packed file may follow, which continues the text
-                    packed, self._in_member = self._unpack.unused_data.lstrip(b"\0"), False
+                    packed = self._unpack.unused_data.lstrip(b"\0")
+                    self._in_member = False
                     self._unpack = zlib.decompressobj(16 + zlib.MAX_WBITS)
         except zlib.error as error:
             self.broken = str(fail(self.source, "a packed file without damage", error))

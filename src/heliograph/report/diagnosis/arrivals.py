@@ -165,7 +165,8 @@ class Arrivals:
         if self.period is None:
             return self.time[lost]
         # Of a sender slower than the rows: times of the filled slots, those of the arrivals.
-        clock, filled = _convert_times_to_numbers(self.time), np.flatnonzero(self.slots)
+        clock = _convert_times_to_numbers(self.time)
+        filled = np.flatnonzero(self.slots)
         times = clock[self.arrived]
         if len(filled) != len(times):  # several came in one slot: slots evenly from the first arrival to the last
             times = np.interp(filled, [filled[0], max(filled[-1], filled[0] + 1)], [times[0], times[-1]])
@@ -261,14 +262,11 @@ def list_arrivals(network: Network, times: np.ndarray, received: Mapping[str, np
     for node, z in received.items():
         receiver = network.nodes[node]
         limits = receiver.limits
-        refuses_values, refuses_stuck_values = limits is not None, limits is not None and limits.stuck is not None
+        refuses_values = limits is not None
+        refuses_stuck_values = limits is not None and limits.stuck is not None
         declared = _read_declared_sending(receiver)
         for i, name in enumerate(receiver.received_names):
             arrived_in_row = ~np.isnan(z[:, i])
-            # Numbers that come with the values, such as a mode, stand behind them and have no share.
-            stated_share = None
-            if declared.shares is not None and i < len(declared.shares):
-                stated_share = float(declared.shares[i])
             links.append(
                 Arrivals(
                     node=node,
@@ -278,7 +276,7 @@ def list_arrivals(network: Network, times: np.ndarray, received: Mapping[str, np
                     values=z[arrived_in_row, i],
                     may_be_lost=declared.may_be_lost,
                     declared_period=declared.period,
-                    stated_share=stated_share,
+                    stated_share=declared.find_share(i),
                     of_messages=of_messages,
                     refuses=refuses_values,
                     watched=refuses_stuck_values,
@@ -297,6 +295,13 @@ class _DeclaredSending(NamedTuple):
     period: int | None
     may_be_lost: bool
     shares: Float[np.ndarray, " received"] | None
+
+    def find_share(self, i: int) -> float | None:
+        """Return the probability that received number i arrives; None if it is not constant.
+
+        Numbers that come with the values, such as a mode, stand behind them and have none.
+        """
+        return None if self.shares is None or i >= len(self.shares) else float(self.shares[i])
 
 
 def _read_declared_sending(receiver: Any) -> _DeclaredSending:

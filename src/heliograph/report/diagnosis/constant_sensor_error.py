@@ -70,7 +70,8 @@ def find_constant_error(
     if not 2 <= len(names) <= MOST:
         return None
     outcome = filter.run(measurements, inputs)
-    e, s = np.asarray(outcome.innovations), np.asarray(outcome.innovation_covariances)
+    e = np.asarray(outcome.innovations)
+    s = np.asarray(outcome.innovation_covariances)
     arrived, variance = ~np.isnan(e), np.diagonal(s, axis1=1, axis2=2)
     # Usual deviation of each output's innovations (m,): root of the median claimed variance, 0 if none arrived.
     by_output = zip(variance.T, arrived.T, strict=True)
@@ -172,7 +173,8 @@ def _estimate_error(
     """
     # r' w of each row; sum r' r and sum r' w over all rows.
     row_agreements = np.sum(white_response * white, axis=1)
-    weight, agreement = float(np.sum(white_response**2)), float(np.sum(white_response * white))
+    weight = float(np.sum(white_response**2))
+    agreement = float(np.sum(white_response * white))
     if not (weight > 0 and np.isfinite(agreement)):
         return None
     error = agreement / weight

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -74,6 +75,14 @@ class FilterHealth:
         return 0 if self.white is None else int(np.count_nonzero(~np.isnan(self.white)))
 
 
+class _MeanSquare(NamedTuple):
+    """Mean of innovation^2 / claimed variance, 1 where the claim holds; its standard error, and of how many numbers."""
+
+    size: float
+    error: float
+    numbers: int
+
+
 @dataclass(frozen=True)
 class Health:
     """A record, with the diagnosis of links and filters."""
@@ -101,8 +110,10 @@ class Health:
         lines = [*self.record.failures(), *self.describe_stuck_outputs().values(), *self.doubtful_estimates]
         lines += [f"{node}: {found.describe()}" for node, found in self.silences.items()]
         lines += self._describe_losses()
-        lines += [] if self.error_between_nodes is None else [say_node_differs(self.error_between_nodes)]
-        lines += [self.time_unit] if self.time_unit else []
+        if self.error_between_nodes is not None:
+            lines.append(say_node_differs(self.error_between_nodes))
+        if self.time_unit:
+            lines.append(self.time_unit)
         return lines + [line for filter in self.list_doubted_filters() for line in self._describe_doubts(filter)]
 
     def _describe_losses(self) -> Iterator[str]:
@@ -202,18 +213,18 @@ class Health:
         mean square `power` and its standard error.
         """
         # `level`: probability of a false alarm that one test may have.
-        name, level = f"{health.node}/{health.filter}", self._level_of_one_test()
+        name = f"{health.node}/{health.filter}"
+        level = self._level_of_one_test()
         of_filter = [one for one in self.outputs if (one.node, one.filter) == (health.node, health.filter)]
-        # Outputs with enough innovations. `measured`: for each output the mean of innovation^2 / claimed variance, its
-        # standard error, and the number of innovations; under the name "" for all outputs together. `signs`: 1 of
-        # outputs that are significantly larger, -1 smaller, 0 neither.
+        # Mean squares of the outputs with enough innovations, and their signs: 1 if significantly too large, -1 if too
+        # small, else 0.
         judged = [output.judged for output in of_filter if output.judged.summary.received > LAGS]
-        measured = {output.output: (output.size, output.size_error, output.summary.received) for output in judged}
-        signs = {output: judge_size(*numbers, level / len(measured)) for output, numbers in measured.items()}
-        if not any(signs.values()):  # none is wrong by itself
-            measured = {"": (test.power, test.power_error, health.numbers)}
+        measured = {one.output: _MeanSquare(one.size, one.size_error, one.summary.received) for one in judged}
+        signs = {output: judge_size(*square, level / len(measured)) for output, square in measured.items()}
+        if not any(signs.values()):  # none is wrong by itself: judge all together, under the name ""
+            measured = {"": _MeanSquare(test.power, test.power_error, health.numbers)}
             signs = {"": judge_size(*measured[""], level)}
-        sizes = {output: size for output, (size, _, _) in measured.items()}
+        sizes = {output: square.size for output, square in measured.items()}
         larger = [output for output, sign in signs.items() if sign > 0]
         # An output that is far off spoils the estimates, so that others look a little larger too: these are not named.
         largest_excess = max((sizes[output] - 1 for output in larger), default=0.0)

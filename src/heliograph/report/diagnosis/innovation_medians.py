@@ -36,7 +36,8 @@ def compute_innovation_medians(
         return np.zeros(receiver.received)
     # The median of a symmetric law is 0. It is taken for 0 too behind a link with memory, with delayed outputs
     # (`past`), or with other outputs than the received numbers, where M (v - E v) does not describe the innovation.
-    noise, channel = first(receiver.sensor).noise, first(receiver.channel).condition_on_arrival()
+    noise = first(receiver.sensor).noise
+    channel = first(receiver.channel).condition_on_arrival()
     if noise.is_symmetric or channel.remembers or channel.past or channel.outputs != receiver.received:
         return np.zeros(receiver.received)
     # M (v - E v) of drawn noises, (draws, received), with the mean gain M.

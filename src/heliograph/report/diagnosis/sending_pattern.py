@@ -32,7 +32,8 @@ def find_pattern(arrived: Bool[np.ndarray, " time"]) -> SendingPattern | None:
         # Only the rows of `finer` among the due rows are due. Both patterns together repeat after some repetitions of
         # the first: the fewest for which repetitions * due is a multiple of len(finer).
         repetitions = len(finer) // np.gcd(due, len(finer))
-        due, length = int(finer.sum()) * due * repetitions // len(finer), length * repetitions
+        due = int(finer.sum()) * due * repetitions // len(finer)
+        length = length * repetitions
         rows[rows] = np.resize(finer, int(rows.sum()))
         finer = _find_least_probable_rows(arrived[rows])
     return None if length == 1 else SendingPattern(due, length, rows)
@@ -49,9 +50,11 @@ def _find_least_probable_rows(arrived: Bool[np.ndarray, " rows"]) -> Bool[np.nda
     # Losses at random, in bursts: a law fitted to the intervals between arrivals.
     arrivals = np.flatnonzero(arrived)
     intervals = np.diff(arrivals)
+    if not len(intervals):
+        return None
     law = BurstLossLaw.fit_to_intervals(intervals)
     least, found = np.log(CHANCE), None
-    for length in range(2, min(LONGEST, len(arrived) // 2) + 1 if len(intervals) else 0):
+    for length in range(2, min(LONGEST, len(arrived) // 2) + 1):
         pattern = np.bincount(arrivals % length, minlength=length) > 0
         if pattern.all():
             continue
@@ -123,7 +126,10 @@ class BurstLossLaw(NamedTuple):
                 if scale == 0:
                     return -np.inf
                 log_scale += log(scale)
-                stay, stay_1, stay_2, later = stay / scale, stay_1 / scale, stay_2 / scale, later / scale
+                stay = stay / scale
+                stay_1 = stay_1 / scale
+                stay_2 = stay_2 / scale
+                later = later / scale
         return log_scale + (log(stay) if stay > 0 else -np.inf) - count * log_z
 
 

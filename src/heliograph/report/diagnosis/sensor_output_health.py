@@ -6,7 +6,7 @@ down-weighted below 1/2. A listener is a filter with what it receives.
 
 from collections import Counter, defaultdict, deque
 from collections.abc import Iterator, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -61,6 +61,7 @@ def compute_filter_errors(record: Record) -> list[FilterErrors]:
             claimed = ~np.isnan(nees)
             has_nees = bool(claimed.any())
             per_state = nees / np.where(known > 0, known, np.nan)
+            _mean, error_of_mean = average_correlated(per_state) if has_nees else (np.nan, np.nan)
             results.append(
                 FilterErrors(
                     node=node,
@@ -69,7 +70,7 @@ def compute_filter_errors(record: Record) -> list[FilterErrors]:
                     rmse=rmse,
                     rmse_error=_estimate_rmse_errors(record, node, name, rmse),
                     nees=float(nees[claimed].sum() / known[claimed].sum()) if has_nees else np.nan,
-                    nees_error=average_correlated(per_state)[1] if has_nees else np.nan,
+                    nees_error=error_of_mean,
                 )
             )
     return results
@@ -149,9 +150,11 @@ def yield_filters_with_measurements(network: Network, record: Record) -> Iterato
     A filter is trusted if the network relies on it. It blames (its weights decide which outputs are bad) if it weighs
     outputs and is trusted, or if it weighs outputs and no trusted filter of the node does.
     """
-    received, relied_on = record.measurements, _list_relied_on_filters(network)
+    received = record.measurements
+    relied_on = _list_relied_on_filters(network)
     for node, z in received.items():
-        filters, names = network.nodes[node].filters, list(network.nodes[node].received_names)
+        filters = network.nodes[node].filters
+        names = list(network.nodes[node].received_names)
         weighing = {name for name, filter in filters.items() if filter.received and weighs(filter)}
         blaming = (weighing & relied_on[node]) or weighing  # trusted ones, or all if no trusted filter weighs
         for name, filter in filters.items():
@@ -184,10 +187,16 @@ def _list_relied_on_filters(network: Network) -> dict[str, set[str]]:
 
 def weighs(filter: AbstractFilter) -> bool:
     """Return whether a filter weighs received components by how likely they are, as a filter against outliers does."""
-    # Trace one correction without computing it: the weight in its result is None if the filter does not weigh.
+
+    def make_innovation(state: Any, z: Any) -> Any:
+        """Return the innovation of one correction of `state` by the received numbers z."""
+        _corrected, innovation = filter.correct(state, z)
+        return innovation
+
+    # Trace one correction without computing it: the innovation's weight is None if the filter does not weigh.
     with jax.enable_x64(True):
         state = jax.tree.map(np.asarray, filter.init())
-        innovation = jax.eval_shape(lambda before, z: filter.correct(before, z)[1], state, np.zeros(filter.received))
+        innovation = jax.eval_shape(make_innovation, state, np.zeros(filter.received))
     return innovation.weight is not None
 
 
@@ -222,8 +231,8 @@ def judge_outputs_of_filter(
     laws = list_noise_laws(network, listener.node)
     # A message may report numbers that a filter takes as they are, such as its gain or a flag. Their innovations have
     # variance 0, and are not judged.
-    is_taken_as_told = np.any(variance == 0, axis=0) & ~np.any(variance > 0, axis=0)
-    outputs = np.flatnonzero(~is_taken_as_told)
+    is_taken_as_given = np.any(variance == 0, axis=0) & ~np.any(variance > 0, axis=0)
+    outputs = np.flatnonzero(~is_taken_as_given)
     judged = judge_outputs(
         names=[listener.outputs[i] for i in outputs],
         received=listener.measurements[:, outputs],
@@ -278,7 +287,8 @@ def judge_outputs(
     # Indices of the outputs of which significantly more values are down-weighted than of the others.
     outlying = InnovationSummary.find_outlying(summaries) if blames else []
     # Squares, over their variances, of the innovations that the filter used (time, m).
-    squares, variance = innovations.square_used(), np.asarray(innovations.variance)
+    squares = innovations.square_used()
+    variance = np.asarray(innovations.variance)
     judged = []
     for i, (name, summary) in enumerate(zip(names, summaries, strict=True)):
         size, size_error = compute_ratio_of_squares(squares[:, i], expected[:, i])

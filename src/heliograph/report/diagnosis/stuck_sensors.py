@@ -50,7 +50,8 @@ def list_noise_laws(network: Network, node: str) -> list[NoiseLaw]:
         return unknown
     # Each received number must be an output of the sensor, passed on unchanged; of a sensor that changes over time the
     # first is taken.
-    sensor, outputs = first(receiver.sensor), tuple(range(receiver.received))
+    sensor = first(receiver.sensor)
+    outputs = tuple(range(receiver.received))
     if len(sensor.outputs) != receiver.received or not delivers_as_sent(first(receiver.channel), outputs):
         return unknown
     # Probability, mean and variance of each Gaussian branch (outputs, branches).

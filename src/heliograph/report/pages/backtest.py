@@ -47,7 +47,8 @@ class CoverageMiss:
         number inside the interval has the binomial law with the claimed share.
         """
         count = max(self.score.compared // self.score.horizon, 1)
-        claimed, inside = CLAIMED[self.level], self.score.coverage[self.level].value * count
+        claimed = CLAIMED[self.level]
+        inside = self.score.coverage[self.level].value * count
         if self.excess < 0:  # P(at most as many inside), rounded up
             return float(bdtr(np.ceil(inside), count, claimed))
         # P(at least as many inside), rounded down.
@@ -58,7 +59,9 @@ class CoverageMiss:
 
         `self.level` is the interval's index in SHARES, and `self.excess` the share that it held minus that it claims.
         """
-        score, claim, share = self.score, SHARES[self.level], self.score.coverage[self.level]
+        score = self.score
+        claim = SHARES[self.level]
+        share = self.score.coverage[self.level]
         verdict = "too sure" if self.excess < 0 else "too cautious"
         forecast = f"{score.part} {score.name}, {score.horizon} ahead"
         return f"{forecast}: the interval of {claim} held {share.value:.1%} +- {share.error:.1%}: {verdict}"
@@ -105,9 +108,9 @@ def make_backtest_results(found: "heliograph.forecasting.Backtest", network: str
         refit: rows between fits of its free numbers; 0 by default, for none.
     """
     return ResultsContent(
-        {"coverage": _draw_coverage(found)},
-        lambda drawings: make_backtest_page(found, network, drawings, refit),
-        _list_all_numbers(found) | ({"refit": refit} if refit else {}),
+        figures={"coverage": _draw_coverage(found)},
+        page=lambda drawings: make_backtest_page(found, network, drawings, refit),
+        summary=_list_all_numbers(found) | ({"refit": refit} if refit else {}),
     )
 
 
@@ -146,7 +149,7 @@ def _draw_coverage(found: "heliograph.forecasting.Backtest") -> Figure:
     numbers = list(dict.fromkeys((s.node, s.part, s.name) for s in found.scores))[:PANELS]
     filters = list(dict.fromkeys(s.filter for s in found.scores))
     nodes = {node for node, _, _ in numbers}
-    figure, panels = make_stacked_panels(len(numbers), 1.3, 0.9)
+    figure, panels = make_stacked_panels(len(numbers), height=1.3, margin=0.9)
     for axes, (node, part, name) in zip(panels, numbers, strict=True):
         for i, filter in enumerate(filters):
             scores = [s for s in found.scores if (s.node, s.part, s.name, s.filter) == (node, part, name, filter)]

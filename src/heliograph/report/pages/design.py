@@ -51,10 +51,10 @@ class DesignResults:
 def make_design_results(results: DesignResults) -> ResultsContent:
     """Return the content of the results folder of a design: figures, page, summary and the two networks' sources."""
     return ResultsContent(
-        draw_design_figures(results),
-        partial(make_design_page, results),
-        make_design_summary(results),
-        partial(write_networks, results),
+        figures=draw_design_figures(results),
+        page=partial(make_design_page, results),
+        summary=make_design_summary(results),
+        write_data=partial(write_networks, results),
     )
 
 
@@ -220,7 +220,8 @@ def _make_powers_section(results: DesignResults, drawings: Mapping[str, bytes]) 
 
     `slope`: by transmitter the change of the error for one unit more of its mean power, negative where that helps.
     """
-    after, slope = compute_mean_powers(results.design), results.design.sensitivity
+    after = compute_mean_powers(results.design)
+    slope = results.design.sensitivity
     rows = [
         [visible(name), f"{results.before.get(name, float('nan')):.4g}", f"{power:.4g}",
          f"{np.max(results.design.powers[name]):.4g}", f"{max(-slope[name], 0.0):.3g}"]

@@ -92,7 +92,7 @@ def _draw_estimates(learned: FitResults) -> Figure:
     # The best form is the last of the solutions. It is drawn at height 0, another one below it at -1.
     forms = [solution.form for solution in reversed(learned.fit.solutions)]
     by_form = [learned.fit.rows(form=form) for form in forms]
-    figure, grid = make_stacked_panels(len(rows), 0.62, 0.6, sharex=False)
+    figure, grid = make_stacked_panels(len(rows), height=0.62, margin=0.6, sharex=False)
     for i, (axes, row) in enumerate(zip(grid, rows, strict=True)):
         for height, estimates in enumerate(by_form):
             color, width = (BLUE, 3.0) if height == 0 else (MUTED, 1.5)
@@ -122,7 +122,7 @@ def _draw_estimate(axes: Axes, row: Row, height: float, color: str, width: float
 @matplotlib.rc_context(STYLE)
 def _draw_correlations(tested: list[PredictionBeforeAndAfter]) -> Figure:
     """Draw the correlations of innovations some rows apart, before and after learning, with 95 % intervals."""
-    figure, grid = make_stacked_panels(len(tested), 1.6, 0.7)
+    figure, grid = make_stacked_panels(len(tested), height=1.6, margin=0.7)
     for axes, change in zip(grid, tested, strict=True):
         # Bars before learning stand left of each lag, those after it right.
         sides = ((-0.17, AMBER, change.before.test, "before"), (0.17, BLUE, change.after.test, "after"))
@@ -146,7 +146,7 @@ def _draw_probability_transforms(received: list[HeldOutTransforms]) -> Figure:
 
     The grey band holds 95 % of the bars then.
     """
-    figure, grid = make_stacked_panels(len(received), 1.5, 0.7)
+    figure, grid = make_stacked_panels(len(received), height=1.5, margin=0.7)
     edges = np.linspace(0, 1, BINS + 1).tolist()
     for axes, transforms in zip(grid, received, strict=True):
         values = transforms.pit[~np.isnan(transforms.pit)]

@@ -111,7 +111,7 @@ def _draw_predicted(health: Health, node: str) -> Figure:
     names = next(iter(laws.values())).names
     z = record.measurements.get(node)
     data = np.concatenate(list(record.measurements.values()), axis=1) if z is None else z
-    figure, panels = make_stacked_panels(min(len(names), PANELS), 1.7, 0.8)
+    figure, panels = make_stacked_panels(min(len(names), PANELS), height=1.7, margin=0.8)
     for i, panel in enumerate(panels):
         for (name, law), colour in zip(laws.items(), COLOURS, strict=False):
             mean, band = law.mean[:, i], BAND * law.deviation[:, i]

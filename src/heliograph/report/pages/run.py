@@ -59,7 +59,7 @@ def make_run_results(health: Health, network: str) -> ResultsContent:
     `health`: the record of the run with its diagnosis. `network`: the user's name of the network.
     """
     return ResultsContent(
-        run_figures(health), partial(run_page, health, network), run_summary(health), lambda folder: None
+        figures=run_figures(health), page=partial(run_page, health, network), summary=run_summary(health)
     )
 
 
@@ -78,7 +78,12 @@ def make_results_of_plants(examined: Mapping[str, Health], network: str) -> Resu
             write_into_folder(make_run_results(health, f"{network}, {plant}"), subfolder)
 
     summary: dict[str, Json] = {plant: run_summary(health) for plant, health in examined.items()}
-    return ResultsContent({}, lambda _: _make_overview(examined, network, folders), summary, write)
+    return ResultsContent(
+        figures={},
+        page=lambda drawings: _make_overview(examined, network, folders),
+        summary=summary,
+        write_data=write,
+    )
 
 
 def _make_overview(examined: Mapping[str, Health], network: str, folders: Mapping[str, str]) -> Page:
@@ -114,7 +119,7 @@ def run_figures(health: Health) -> dict[str, Figure]:
     drawn: dict[str, Figure] = {}
     if find_coordinates(health.record.states) is not None:
         for kind, record in _collect_estimates(health):
-            node = _choose_nodes_to_draw(record)[0]
+            node, *_others = _choose_nodes_to_draw(record)
             drawn[_name_position_map(kind)] = draw_position_map(
                 record, node, list(record.estimates[node])[: len(COLOURS)]
             )
@@ -160,7 +165,7 @@ def _draw_estimates(health: Health, record: Record, node: str) -> Figure:
     `record` holds the rows to draw. Forecasts are drawn only if these are all rows of `health`. There are at most as
     many filters as COLOURS.
     """
-    figure, grid = make_stacked_panels(len(record.states), 1.7, 0.8)
+    figure, grid = make_stacked_panels(len(record.states), height=1.7, margin=0.8)
     names = list(record.estimates[node])[: len(COLOURS)]
     record.plot(node, names, axes=grid, sigmas=BAND)
     if record is health.record:
@@ -183,13 +188,15 @@ def run_page(health: Health, network: str, drawings: Mapping[str, bytes]) -> Pag
     """
     instance("health", health, Health, "what examine returns")
     instance("name of the network", network, str, "a text")
-    record, doubts, drawings = health.record, health.warnings(), limit_size_of_drawings(drawings, PAGE)
+    record = health.record
+    doubts = health.warnings()
+    drawings = limit_size_of_drawings(drawings, PAGE)
     rows = f"{len(record.time):,} rows, {_describe_span(record)}"
     glance = [
         _make_key_figures(health, len(doubts)),
         *_list_doubts(doubts),
         *_list_baseline_remarks(health),
-        *_list_filters_of_other_worlds(health),
+        *_list_filters_of_other_models(health),
         *_describe_overloads(record),
     ]
     forecasts = [Section("Forecasts", make_forecast_tables(record, health.forecasts))] if health.forecasts else []
@@ -250,6 +257,7 @@ def _make_headline(health: Health) -> str:
     trusted = {filter.filter for filter in health.filters if filter.trusted and filter.node == node}
     name = next((name for name in record.estimates[node] if name in trusted), next(iter(record.estimates[node])))
     estimate = record.estimates[node][name]
+    # Mean and standard deviations of the states in the last row.
     mean = np.asarray(estimate.mean)[-1]
     deviation = np.sqrt(np.maximum(np.diagonal(np.asarray(estimate.covariance)[-1]), 0.0))
     shown_states = find_coordinates(record.states) or tuple(range(min(len(mean), 2)))
@@ -360,7 +368,7 @@ def _list_baseline_remarks(health: Health) -> list[Text | Points]:
     return [Text([text]), Points(lines)] if lines else []
 
 
-def _list_filters_of_other_worlds(health: Health) -> list[Text | Points]:
+def _list_filters_of_other_models(health: Health) -> list[Text | Points]:
     """Return a paragraph and a list of filters whose assumed model is not that of their node; [] if there are none."""
     text = "These filters were made for another world than that in which they stand, and claim no more than a number:"
     return [Text([text]), Points([visible(line) for line in health.beliefs])] if health.beliefs else []

@@ -28,10 +28,10 @@ def draw_worth(worth: SensorWorth, title: str) -> Figure:
         title: how errors were found, in words.
     """
     rows = len(worth.cases)
-    figure, panels = make_stacked_panels(len(worth.states), 0.55 + 0.26 * rows, 0.5)
+    figure, panels = make_stacked_panels(len(worth.states), height=0.55 + 0.26 * rows, margin=0.5)
     figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     units, limits = units_in(worth.states), _find_limits(worth)
-    for panel, i in zip(panels, range(len(worth.states)), strict=True):
+    for i, panel in enumerate(panels):
         _draw_bars_of_state(panel, worth, i, limits)
         state = label_with_unit(str(worth.states[i]), units)
         panel.set_title(f"{state}: with all nodes {worth.complete.error[i]:.3g}")
