@@ -333,7 +333,8 @@ def _make_delays_section(learned: FitResults) -> list[Section]:
         for steps, share in delays.shares.items()
     ]
     caption = (
-        "How long measurements were on their way, in steps, with the probability of each delay and its 95 % interval. "
+        "How long measurements were on their way, to the nearest step, with the probability of each delay and its 95 % "
+        "interval. "
         "`delays[node].law` of a fit is the law, for `hg.model.delayed(link, law)`."
     )
     table = Table(["node", "seconds late", "probability", "95 %"], rows, caption)
