@@ -164,6 +164,9 @@ def test_the_noise_of_a_bag_is_learned(folder, capsys):
     (row,), (share,) = fitted["table"], fitted["delays"]["gps"]["shares"]
     assert row["low"] <= 0.04 <= row["high"] < 0.15
     assert (share["steps"], share["estimate"]) == (0, 1.0) and "gps: late by 0 s 1 (" in capsys.readouterr().out
+    # The page's column has seconds, so its caption does not say steps.
+    page = (folder / "out" / "report.html").read_text()
+    assert "seconds late" in page and "on their way, to the nearest step" in page
 
 
 def test_times_that_no_stamp_of_a_bag_can_say_are_one_line(tmp_path, monkeypatch, capsys):

@@ -142,11 +142,14 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def whole_files(paths: Sequence[Path]) -> Iterator[list[Path]]:
-    """Yield temporary files next to several small ones, which they replace together, or not at all after an error."""
+    """Yield a temporary file for each of `paths`; at the end they replace `paths` together, or none after an error.
+
+    The earlier contents are held in memory meanwhile, so the files should be small.
+    """
     partials = [path.with_name(f".{path.name}.{os.getpid()}.partial") for path in paths]
     for path in paths:
         _remove_leftover_files(path)
-    replaced: list[tuple[Path, bytes | None]] = []  # with the earlier contents, None of a file that is new
+    replaced: list[tuple[Path, bytes | None]] = []  # (path, its earlier contents; None if the file is new)
     try:
         with name_path_in_errors(paths[0]):
             yield partials
@@ -162,8 +165,8 @@ def whole_files(paths: Sequence[Path]) -> Iterator[list[Path]]:
         with hold_signals():
             for partial in partials:
                 partial.unlink(missing_ok=True)
-            are_all_replaced = len(replaced) == len(paths)
-            for path, before in () if are_all_replaced else replaced:
+            to_undo = replaced if len(replaced) < len(paths) else []
+            for path, before in to_undo:
                 if before is None:
                     path.unlink()
                 else:
@@ -180,8 +183,8 @@ def _remove_leftover_files(path: Path) -> None:
 
 
 def _is_running(process: str) -> bool:
-    """Return whether a process of this number runs; True if that is unknown."""
-    # Signal 0 is never sent. The call fails if there is no such process.
+    """Return whether the process with this number (a text, from a file's name) runs; True if that is unknown."""
+    # Signal 0 sends nothing, but the call fails if there is no such process.
     try:
         os.kill(int(process), 0)
     except ProcessLookupError:
@@ -212,7 +215,7 @@ def check_writable(path: str | Path, formats: Sequence[str] = FORMATS) -> None:
 
 
 def check_folder_writable(folder: str | Path) -> None:
-    """Raise ValueError unless files can be written in the folder, or it can be made."""
+    """Raise ValueError unless files can be written in the folder, or in the folder in which it would be made."""
     folder = Path(folder)
     existing = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
     name = f"output folder {folder}"
@@ -349,9 +352,9 @@ def _restore_old_folder(temporary: Path, target: Path) -> None:
 
 
 def _replace_folder(partial: Path, target: Path) -> None:
-    """Put the new folder of `partial` in place of `target` by two renames, and remove the old one.
+    """Put `partial`/new in place of `target` by two renames; the old `target` is removed.
 
-    One with files that `whole_folder` did not write is kept instead, under another name.
+    If somebody else's files are in the old folder, it is not removed but kept under another name, with a warning.
     """
     if target.exists() and find_foreign_files(target):
         kept = Path(tempfile.mkdtemp(prefix=f"{target.name}-kept-", dir=target.parent))
@@ -367,10 +370,11 @@ def _replace_folder(partial: Path, target: Path) -> None:
 
 
 def remove_leftover_folders(target: Path) -> None:
-    """Remove the temporary folders next to `target` that killed processes left.
+    """Remove the temporary folders next to `target` that killed processes of `whole_folder` left.
 
-    A running process holds a lock on its folder, which stays. A folder with other contents is not ours, and stays too.
-    Earlier results that were moved aside are put back.
+    Such a folder is named .TARGET-xxxxxxxx and holds at most the folders "new" (unfinished results) and "old" (earlier
+    results, which are put back if `target` is missing). A running process holds a lock on its folder, which stays. A
+    folder with other contents is not ours, and stays too.
     """
     if not target.parent.is_dir():
         return

@@ -22,12 +22,16 @@ def refuse_replacing(read: Iterable[object], written: Iterable[object], folder: 
     if folder is None:
         return
     replaced = folder.resolve()
+    # A path in the folder would be lost with it. A file that was read but is gone by now cannot be.
     for path in [*sources, *files]:
         if replaced in (path.resolve(), *path.resolve().parents) and (path in files or path.exists()):
             raise fail(f"output folder {folder}", f"one without {path.name}, which would be lost with it", str(path))
 
 
 def find_network_file(reference: str) -> Path:
-    """Return the file of a user's name of a network, "my_network.py:name"; of a module one that is not there."""
+    """Return the file in a reference to a network, such as my_network.py in "my_network.py:name".
+
+    Of a reference without a file ("module:name") the path that is returned names no file that exists.
+    """
     stem, _, _ = reference.rpartition(".py")
     return Path(f"{stem}.py")

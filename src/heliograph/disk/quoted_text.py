@@ -3,7 +3,7 @@
 import re
 from collections.abc import Mapping, Sequence
 
-NAMED = 3  # of many names, how many are said
+NAMED = 3  # how many of many names are said
 FORMULA = ("=", "+", "-", "@", "\t", "\r")  # a cell that begins so is computed by a spreadsheet
 
 
@@ -25,7 +25,7 @@ def quote_for_cell(text: str) -> str:
 
 
 def unquote_cell(cell: str) -> str:
-    """Undo `quote_for_cell`, but for characters that cannot be printed."""
+    """Undo `quote_for_cell`, except that characters which cannot be printed stay replaced by their codes."""
     return cell[1:] if cell.startswith("'") and cell.lstrip("'").startswith(FORMULA) else cell
 
 
@@ -41,7 +41,7 @@ def unquote_file(text: str) -> str:
 
 
 def join_names(names: Sequence[str]) -> str:
-    """Return names on a line; if they are more than 2 NAMED, the first NAMED and how many there are."""
+    """Return names joined by commas; of more than 6 names only the first 3, followed by how many there are."""
     if len(names) <= 2 * NAMED:
         return ", ".join(names)
     return f"{', '.join(names[:NAMED])} … ({len(names)})"

@@ -26,7 +26,12 @@ TABLES = {
 
 @dataclass(frozen=True)
 class MapPlaces:
-    """A function of a Python file that returns the network for a place (x, y), and the places, in its units."""
+    """Places over which the error of a design is mapped: a grid of x and y, and a network for each place.
+
+    Attributes:
+        build: function of the user's Python file that returns the network for a place (x, y).
+        x, y: coordinates of the grid, in the units of this function.
+    """
 
     build: Callable[[float, float], Network]
     x: np.ndarray
@@ -35,14 +40,14 @@ class MapPlaces:
 
 @dataclass(frozen=True)
 class DesignFile:
-    """A design file as read; `reference` and `source` are the network's name in it and its Python source."""
+    """A design file as read: the network, the design problem, and further results that are asked for."""
 
-    reference: str
-    source: str
+    reference: str  # FILE or FILE:NAME of the network
+    source: str  # content of that Python file
     network: Network
     problem: DesignProblem
-    front: tuple[float, ...] | None
-    exponent: float | None
+    front: tuple[float, ...] | None  # total powers, for each of which the least error is wanted
+    exponent: float | None  # of the path loss: received power falls as distance to minus this power
     map: MapPlaces | None
 
 
@@ -156,9 +161,9 @@ def _find_python_file(path: Path, value: object, key: str) -> tuple[Path, str]:
 
 
 def _read_table(path: Path, table: Mapping[str, object], key: str) -> dict[str, Any]:
-    """Return the table under a key of the design file; raise if something else stands there.
+    """Return the table under a key that the design file has; raise ValueError if something else stands there.
 
-    TABLES holds the known keys of each table.
+    Its keys were checked when the file was read. TABLES, the known keys of each table, serves the error's text.
     """
     value = table[key]
     if not isinstance(value, dict):

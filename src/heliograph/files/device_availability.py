@@ -88,17 +88,13 @@ class DeviceStatuses:
     """
 
     def __init__(self, conditions: Iterable[Available]):
-        """Begin before any device has said whether it is online.
-
-        A condition says on which topics devices say so, and by which words. `_offline` holds the pairs (condition,
-        topic) whose last word was offline, `_heard` the conditions for which any word came, and `_changed` the topics
-        whose word has changed.
-        """
-        self._by_pattern: dict[str, list[Available]] = {}
+        """Begin before any device has sent a status. A condition tells on which topics and by which words they do."""
+        self._by_pattern: dict[str, list[Available]] = {}  # conditions by their topic, which may have wildcards
         for condition in dict.fromkeys(conditions):
             self._by_pattern.setdefault(condition.topic, []).append(condition)
-        self._offline = set[tuple[Available, str]]()
-        self._heard, self._changed = set[Available](), set[str]()
+        self._offline = set[tuple[Available, str]]()  # (condition, topic) whose last word was offline
+        self._heard = set[Available]()  # conditions for which any word came
+        self._changed = set[str]()  # topics whose status changed since `pop_changed_statuses`
 
     @property
     def topics(self) -> list[str]:
@@ -111,7 +107,10 @@ class DeviceStatuses:
         return [topic for topic, several in self._by_pattern.items() if not self._heard.intersection(several)]
 
     def find_conditions(self, topic: str) -> list[Available]:
-        """Return the conditions for which a message of this topic is a device's word."""
+        """Return the conditions for which a message of this topic tells whether a device is online.
+
+        Their order is always the same, so that bit i of a stored status means the i-th of them.
+        """
         matching = [several for pattern, several in self._by_pattern.items() if match_topic(topic, pattern)]
         return [condition for several in matching for condition in several]
 
@@ -132,7 +131,8 @@ class DeviceStatuses:
         if not conditions:
             return False
         # The statuses of a topic are one bit for each condition. They are stored when they have changed.
-        content, bits_before = _decode_payload(payload, where), self._encode_statuses_as_bits(topic)
+        content = _decode_payload(payload, where)
+        bits_before = self._encode_statuses_as_bits(topic)
         for condition in conditions:
             self._note_status(condition, topic, offline=content != "" and condition.says_offline(content, where))
         if self._encode_statuses_as_bits(topic) != bits_before:
@@ -169,7 +169,7 @@ class DeviceStatuses:
 
 
 def _decode_payload(payload: object, where: str) -> object:
-    """Return a payload decoded from JSON, or its text if it is not JSON.
+    """Return the payload of a status message: decoded if it is JSON, such as {"state": "online"}, else its text.
 
     A payload that is neither bytes nor text was decoded already, and is returned as it is.
     """

@@ -114,7 +114,11 @@ def load_fitted(reference: str | Path, fitted: str | Path) -> Network:
 
 
 def _tabulate_delays(delays: Delays) -> dict[str, Any]:
-    """Return a law of delays as JSON has it: its step, how many messages it is of, and a row for each delay."""
+    """Return the estimated distribution of a node's delays as JSON has it.
+
+    It has the length of a step, how many messages were counted and how many of them came early, and for each delay in
+    steps its share with an interval.
+    """
     shares = [{"steps": steps, **share._asdict()} for steps, share in delays.shares.items()]
     return {"step": delays.step, "counted": delays.counted, "early": delays.early, "shares": shares}
 
@@ -137,5 +141,5 @@ def _split_reference(reference: str) -> tuple[Path | None, str, str]:
 
 
 def _quote_in_docstring(text: str) -> str:
-    """Return the name of a file so that it ends no docstring."""
+    """Return a file's name without the characters that would end or escape in the docstring of a Python file."""
     return Path(text).name.replace("\\", "/").replace('"', "'")

@@ -32,11 +32,12 @@ def load_network(reference: str) -> Network:
         ValueError: no such module, an error inside it (with its type, message and line), no network, or several and no
             name. One line that names the module.
     """
-    return load_module(reference)[0]
+    network, _names_of_module = load_module(reference)
+    return network
 
 
 def load_module(reference: str) -> tuple[Network, Mapping[str, object]]:
-    """Load a network as `load_network` does, and whatever else its module names, such as `sources` and `pose`."""
+    """Load a network as `load_network` does; return it and {name: value} of its module, such as `sources`, `pose`."""
     file_path("network", reference)
     source_name, _, name = str(reference).rpartition(":")
     if not source_name or not name.isidentifier():  # no name, or the colon of a drive letter
@@ -69,7 +70,7 @@ def load_function(path: Path, source: str, name: str) -> Callable[..., Network]:
         name: name of the function in it.
 
     Returns:
-        The function; what it is called with it takes, and the network that it returns is checked to be one.
+        The user's function, wrapped: it takes the same arguments, and its result is checked to be a network.
 
     Raises:
         ValueError: as `load_network`; calling the function raises the same.
@@ -99,7 +100,11 @@ def load_function(path: Path, source: str, name: str) -> Callable[..., Network]:
 def _find_network(module: ModuleType, name: str, file: str, path: Path | None) -> Network:
     """Return the network called `name` in a module, or its only network if `name` is "".
 
-    `file` is the module's reference, for errors.
+    Args:
+        module: the user's module, after it was run.
+        name: name of a network in it, or of a function that returns one; or "".
+        file: the module's file or name, for errors.
+        path: its file, in which the line of an error is looked for; None if it has none.
     """
     networks = {key: value for key, value in vars(module).items() if isinstance(value, Network)}
     if name:
@@ -117,7 +122,7 @@ def _read_named_network(
 ) -> Network:
     """Return the network that a name of a module stands for, or that the function of this name returns.
 
-    `networks`: those of the module by name, for errors.
+    `networks`: those of the module by name, for errors. `file` and `path`: as of `_find_network`.
     """
     if not hasattr(module, name):
         close = get_close_matches(name, [key for key in vars(module) if not key.startswith("_")], 1)
@@ -133,7 +138,7 @@ def _read_named_network(
 
 
 def _find_source_file(module: str) -> Path | None:
-    """Return the file of an importable module, or None if it has no file; errors are reported with their line in it."""
+    """Return the source file of an importable module, or None if it has none; raise if there is no such module."""
     spec = find_spec(module)
     if spec is None:
         raise ModuleNotFoundError(f"No module named {module!r}")
@@ -180,7 +185,7 @@ def _find_error_line(error: BaseException, path: Path | None) -> str:
 
 @contextmanager
 def _allow_imports_from(folder: Path) -> Iterator[None]:
-    """Let imports find modules in `folder` first."""
+    """Within this context, let imports find modules in `folder` before all others."""
     entry = str(folder.resolve())
     sys.path.insert(0, entry)
     try:

@@ -19,7 +19,7 @@ def suggest_sources(topics: Mapping[str, TopicStatistics], names: Mapping[str, S
     lines.append("sources = {")
     for topic in topics.values():
         topic.choose_time_field()
-    # Whether any topic has dates: then a clock that counts from its own start needs the date of that.
+    # If any topic has dates, a clock that counts from its own start needs the date of this start.
     dated = any(topic.dates or (topic.logged and not topic.own_clock) for topic in topics.values())
     for name, topic in sorted(topics.items()):
         fields = topic.list_fields_by_likelihood()
@@ -30,7 +30,8 @@ def suggest_sources(topics: Mapping[str, TopicStatistics], names: Mapping[str, S
         lines.append(f"    {name!r}: {source},{_comment_on_unit(topic, fields[0])}")
         others = [f"{path}{_comment_on_unit(topic, path, '')}" for path in fields[1:FEW]]
         more = ", ".join(others) + (", ..." if len(fields) > FEW else "")
-        lines += [f"    #   or {more}"] if more else []
+        if more:
+            lines.append(f"    #   or {more}")
     return "\n".join([*lines, "}"])
 
 
@@ -50,12 +51,16 @@ def _suggest_options(topic: TopicStatistics, dated: bool) -> str:
 
 
 def _write_time_option(topic: TopicStatistics, dated: bool) -> str:
-    """Return a time as a source has it: beside dates a clock that counts from its own start has the date of that."""
+    """Return the Python code of a source's time field.
+
+    If other topics have dates (`dated`), a clock that counts from its own start needs the date of this start. 'DATE'
+    stands for it, for the user to fill in.
+    """
     return f"hg.files.Stamp({topic.time!r}, start='DATE')" if topic.own_clock and dated else repr(topic.time)
 
 
 def _write_count_option(topic: TopicStatistics, path: str) -> str:
-    """Return a running count as a source has it: with its bits, where the file says them."""
+    """Return the Python code of a source's running count: its path, and its number of bits if the file gives it."""
     return f"hg.files.Count({path!r}, bits={topic.bits[path]})" if path in topic.bits else repr(path)
 
 

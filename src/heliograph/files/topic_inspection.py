@@ -1,4 +1,7 @@
-"""Topics of a bag, a file or folder of messages, or a vehicle's log, and what their messages have."""
+"""Topics of a bag, a file or folder of messages, or a vehicle's log, and statistics of their messages.
+
+They are shown to a user who wants to know which field of which topic is a measurement (`heliograph inspect`).
+"""
 
 import struct
 from contextlib import suppress
@@ -46,11 +49,12 @@ def _inspect_one_bag(path: Path, topics: dict[str, TopicStatistics], progress: P
 
     Args:
         path: the bag.
-        topics: by name, to which those of the bag are added.
-        progress: called with the numbers of messages read and to be read.
+        topics: statistics of topics by name, to which those of the bag are added.
+        progress: called with how many messages have been read, and how many there are.
     """
+    # `cut_off` is a line that says where the bag was cut off, "" if it is complete.
     with open_bag(path) as (reader, cut_off):
-        # Types first, then each message's times, of which a header is read without decoding the rest.
+        # The types of the topics first; then the times of each message, without decoding more than its stamp.
         for connection in reader.connections:
             topics.setdefault(connection.topic, _describe_type(reader, connection.msgtype))
         total, done = reader.message_count, 0
@@ -58,7 +62,8 @@ def _inspect_one_bag(path: Path, topics: dict[str, TopicStatistics], progress: P
             for done, (connection, logged, data) in enumerate(bag_messages(reader, reader.connections), 1):
                 topic = topics[connection.topic]
                 topic.logged.append(logged)
-                if topic.time is not None and len(data) >= 12:  # 4 bytes of encoding, then the stamp's 8
+                # Messages that begin with a stamp: how long after it they were logged. 4 bytes, then the stamp's 8.
+                if topic.time is not None and len(data) >= 12:
                     topic.late.append((logged - _read_stamp(data)) / SECOND)
                 if progress is not None and done % OFTEN == 0:
                     progress(done, total)
@@ -110,15 +115,14 @@ def inspect_file(path: Path) -> tuple[dict[str, TopicStatistics], str]:
         arrival = None
         with suppress(InputError):
             arrival = None if message.arrival is None else parse_arrival(message.arrival, message.where)
-        # A text payload of a broker's message, with its arrival.
+        # A broker's message has a payload, which is a text, and a time of arrival.
         if message.topic is not None and isinstance(message.content, str) and arrival is not None:
             note_payload(topics, name, message.content, arrival)
             continue
-        # Else the decoded content; if it is no JSON, only the message is counted.
+        # Any other message: its decoded content; if it is no JSON, the message is only counted.
         try:
-            note_message(
-                topics, name, decode_message_content(message), "JSON" if is_message_file(path) else "row", arrival
-            )
+            kind = "JSON" if is_message_file(path) else "row"
+            note_message(topics, name, decode_message_content(message), kind, arrival)
         except InputError:
             note_message(topics, name, None, "no JSON", arrival)
     return topics, broken
@@ -160,7 +164,8 @@ def inspect_log(path: Path, sources: LogSources) -> tuple[dict[str, TopicStatist
         if name not in topics:
             units = log.units.get(name, {})
             known = {signal: unit for signal, unit in units.items() if unit}
-            kind, bits = log.kinds.get(name, "CAN, not described"), log.bits.get(name, {})
+            kind = log.kinds.get(name, "CAN, not described")
+            bits = log.bits.get(name, {})
             topics[name] = TopicStatistics(kind, list(units), measured_in=known, bits=bits)
         topics[name].logged.append(parse_arrival(message.arrival, message.where))
     # Frames without a database have identifiers alone.

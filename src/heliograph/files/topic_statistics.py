@@ -1,21 +1,17 @@
-"""What the messages of a topic have: how many, how often and how late, which fields, and which of these are times."""
+"""Statistics of the messages of a topic: how many, how often, how late, which fields, and which of these are times."""
 
 import re
 from array import array
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
 from heliograph.files.sources.message_fields import TimeUnit, convert_time, decode_json, is_stamp
 from heliograph.numerics.check import InputError
 from heliograph.numerics.times.dates import UNITS, looks_like_date
-
-if TYPE_CHECKING:  # an extra
-    pass
-
 
 SECOND = 1e9  # nanoseconds
 # What messages of devices say of themselves, and not of what they measure; words of a dotted path.
@@ -92,7 +88,9 @@ class TopicStatistics:
 
         It then also says when messages were logged. If that is known already (`self.logged`), no clock is chosen.
         """
-        for path, numbers in self.clocks.items() if not self.logged else ():
+        if self.logged:
+            return
+        for path, numbers in self.clocks.items():
             if len(numbers) == self.messages > 1 and numbers[0] < numbers[-1] and np.all(np.diff(numbers) >= 0):
                 unit = _read_unit_of_clock_name(path)
                 nanoseconds = np.rint(np.array(numbers) * UNITS[unit]).astype(np.int64)
@@ -106,11 +104,11 @@ class TopicStatistics:
         return next((path for path in self.fields if COUNTS.fullmatch(path.split(".")[-1].lower())), None)
 
     def list_fields_by_likelihood(self) -> list[str]:
-        """Return the fields, those first that look like measurements."""
+        """Return the fields besides the running count and times, those first that look like measurements."""
         return sorted((path for path in self.fields if path not in (self.count, *self.units)), key=_rank_field)
 
     def format_row(self) -> list[str]:
-        """Return as texts the type, count, rate, largest gap and lateness (median, 95 % quantile and largest)."""
+        """Return a table's row of texts: type, count, rate, largest gap, lateness (median, 95 % quantile, largest)."""
         self.choose_time_field()
         times = np.sort(np.array(self.logged, dtype=np.int64))
         intervals = np.diff(times) / SECOND
@@ -174,7 +172,7 @@ def _note_date(topic: TopicStatistics, path: str, value: object, arrival: int | 
 
 
 def _match_clock_name(path: str) -> re.Match[str] | None:
-    """Return the match of a path whose last word is named as a clock is; None for any other."""
+    """Return the match of CLOCKS with the last word of a path, if it is a clock's name such as "time_ms"; else None."""
     return CLOCKS.fullmatch(path.split(".")[-1].lower())
 
 
@@ -186,7 +184,7 @@ def _read_unit_of_clock_name(path: str) -> Literal["s", "ms", "us", "ns"]:
 
 
 def _is_clock_from_start(path: str, value: float) -> bool:
-    """Return whether a number is named as a clock is, and no date of these years."""
+    """Return whether a field is named as a clock is, and its number is no date of 2000 to 2044 in any unit."""
     return not isinstance(value, bool) and _find_unit_of_date(value) is None and _match_clock_name(path) is not None
 
 
@@ -201,7 +199,7 @@ def _find_unit_of_date(value: object) -> TimeUnit | None:
 
 
 def _rank_field(path: str) -> int:
-    """Return a field's rank, which is lower the more it looks like a measurement.
+    """Return a field's rank for sorting; the more the field looks like a measurement, the lower it is.
 
     It is 0 inside a payload (PAYLOADS holds the names of such objects), 2 for the device's own state, such as a
     battery's (HOUSEKEEPING matches the words), and 1 for any other field.
@@ -213,9 +211,10 @@ def _rank_field(path: str) -> int:
 
 
 def _yield_leaves(content: object, prefix: str = "", depth: int = 6) -> Iterator[tuple[str, object]]:
-    """Yield (dotted path, value) for each leaf of decoded JSON: neither a dictionary nor a list, or a stamp.
+    """Yield (dotted path, value) for each leaf of decoded JSON: a number, a text, a flag, null, or a stamp.
 
-    A stamp is a dictionary of seconds and nanoseconds. Dictionaries are searched `depth` levels deep.
+    A stamp is a dictionary of seconds and nanoseconds. Lists are left out. Dictionaries are searched `depth` levels
+    deep.
     """
     if isinstance(content, dict) and depth and not is_stamp(content):
         for key, value in content.items():

@@ -46,13 +46,20 @@ STYLE: Any = {  # of matplotlib's rcParams
 
 
 def make_stacked_panels(count: int, height: float, margin: float, sharex: bool = True) -> tuple[Figure, list[Axes]]:
-    """Return a figure with `count` panels of this height in inches one below the other, and a margin for its words."""
+    """Return a figure and its `count` panels, one below the other.
+
+    Args:
+        count: how many panels.
+        height: height of a panel in inches.
+        margin: height in inches for labels and the legend.
+        sharex: whether all panels have the same x axis.
+    """
     figure = Figure(figsize=(WIDTH, margin + height * count), layout="constrained")
     return figure, list(figure.subplots(count, 1, squeeze=False, sharex=sharex)[:, 0])
 
 
 def place_legend_above(figure: Figure, axes: Axes, columns: int = 4) -> None:
-    """Place the legend of `axes` above all panels, in at most so many columns."""
+    """Place the legend of the curves in `axes` above all panels, in at most `columns` columns."""
     handles, names = axes.get_legend_handles_labels()
     legend = axes.get_legend()
     if legend is not None:

@@ -40,10 +40,13 @@ def draw_forecasts(
         names: names of all filters, in the order of their colours.
         sigmas: half width of a band, in claimed deviations.
     """
+    # A filter's colour is that of its position among all filters, with a forecast or without.
     for number, name in enumerate(names):
         if name not in forecasts:
             continue
-        forecast, estimate, colour = forecasts[name], record.estimates[node][name], COLOURS[number % len(COLOURS)]
+        forecast = forecasts[name]
+        estimate = record.estimates[node][name]
+        colour = COLOURS[number % len(COLOURS)]
         time = np.concatenate([record.time[-1:], forecast.time])
         for i, panel in enumerate(panels):
             # The curve begins at the last estimate of state i.
@@ -53,8 +56,9 @@ def draw_forecasts(
             band = sigmas * np.append(last_deviation, forecast.states.deviation[:, i])
             panel.plot(time, mean, color=colour, linestyle=(0, (4, 1.5)))  # dashed
             panel.fill_between(time, mean - band, mean + band, color=colour, alpha=0.2, linewidth=0)
-    for panel in panels if forecasts else ():
-        panel.axvline(record.time[-1], color=MUTED, linewidth=1.0)
+    if forecasts:
+        for panel in panels:
+            panel.axvline(record.time[-1], color=MUTED, linewidth=1.0)
 
 
 def make_forecast_tables(record: Record, forecasts: Forecasts) -> list[Table | Text]:
@@ -94,7 +98,7 @@ def _make_forecast_table(record: Record, name: str, forecast: "heliograph.foreca
 
 
 def _format_mean_and_interval(mean: float, low: float, high: float, deviation: float) -> str:
-    """Return mean and interval as text, to two digits of the deviation; only the mean if the deviation is NaN."""
+    """Return the text "mean (low to high)", to two digits of the deviation; only the mean if the deviation is NaN."""
     if np.isnan(deviation):
         return f"{mean:.4g}"
     return f"{round_to(mean, deviation)} ({round_to(low, deviation)} to {round_to(high, deviation)})"

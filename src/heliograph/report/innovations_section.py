@@ -25,10 +25,10 @@ LOOK = STYLE | {"axes.prop_cycle": cycler(color=COLOURS), "date.converter": "con
 
 
 def group_tested_filters_by_figure(health: Health) -> dict[str, list[FilterHealth]]:
-    """Return {name of a figure of innovations: its filters}.
+    """Return {name of a figure of innovations: filters that it shows}, of the filters whose innovations are tested.
 
     Up to FEW filters share one figure. More filters get a figure for each node, of MOST nodes at most. `filter.white`
-    are innovations in units of their claim, None for a filter without a test.
+    are innovations in units of their claim, None for a filter without one.
     """
     tested = _sort_fused_first(filter for filter in health.filters if filter.white is not None)
     if len(tested) <= FEW:
@@ -41,8 +41,11 @@ def group_tested_filters_by_figure(health: Health) -> dict[str, list[FilterHealt
 
 @matplotlib.rc_context(LOOK)
 def draw_innovations(health: Health, tested: Sequence[FilterHealth]) -> Figure:
-    """Draw the innovations of each filter over time, in claimed deviations, with lines at two of them."""
-    figure, grid = make_stacked_panels(len(tested), 1.5, 0.6)
+    """Draw the innovations of each filter in `tested` over time, in claimed deviations, a panel each.
+
+    Lines at ±BAND (2) deviations show where 95 of 100 should lie.
+    """
+    figure, grid = make_stacked_panels(len(tested), height=1.5, margin=0.6)
     names = _name_components(health)
     for axes, judged in zip(grid, tested, strict=True):
         white = np.asarray(judged.white)  # (time, outputs)
@@ -69,7 +72,7 @@ def _choose_colours(count: int, names: Sequence[str]) -> tuple[list[str], list[s
 
 
 def _name_components(health: Health) -> dict[str, list[str]]:
-    """Return the names of each node's measured components; those of the centre (FUSED) are the names of all nodes."""
+    """Return the names of the components that each node receives; the centre (FUSED) has "node: component" of all."""
     names: dict[str, list[str]] = {}
     for link in health.links:
         names.setdefault(link.node, []).append(link.component)
@@ -143,7 +146,7 @@ def _make_tests_table(health: Health) -> Table:
 
 
 def _sort_fused_first(filters: Iterable[FilterHealth]) -> list[FilterHealth]:
-    """Return the filters, central ones first, else in their order."""
+    """Return the filters with those of the fusion centre first; otherwise their order stays."""
     return sorted(filters, key=lambda judged: judged.node != Network.FUSED)
 
 
@@ -181,7 +184,10 @@ def _make_output_cells(output: OutputHealth) -> list[str]:
 
 
 def _make_declared_table(health: Health) -> list[Table]:
-    """Return the table of what innovations say of variances that messages declare, by class; [] where none do."""
+    """Return the table of what innovations say of noise variances that came with the messages; [] if none came.
+
+    Messages with about the same variance form a class, and each class has a row.
+    """
     rows = []
     for filter in health.filters:
         for judgement in filter.declared:
@@ -199,7 +205,7 @@ def _make_declared_table(health: Health) -> list[Table]:
 
 
 def _make_declared_class_rows(judgement: DeclaredJudgement) -> list[list[str]]:
-    """Return a row of cells for each class of messages that declare about the same variance.
+    """Return a row of cells for each class of messages that came with about the same variance.
 
     The cells are the range of variances, the number of values, the size (mean squared innovation over its variance,
     with its interval), and the scale (the best factor of the declared variances, with its interval; "–" without one).
@@ -222,7 +228,10 @@ def choose_picture(pictures: Mapping[str, Picture]) -> list[Picture | PictureCho
 
 
 def name_undrawn_figures(names: Sequence[str], where: str) -> list[Text]:
-    """Return a text that names what is not drawn for lack of room, and `where` its numbers are; [] without names."""
+    """Return a text with the `names` of what is not drawn for lack of room; [] without names.
+
+    `where` is a sentence on where the numbers are that the figures would show.
+    """
     if not names:
         return []
     return [Text([f"Not drawn, for lack of room: {', '.join(map(visible, names))}. {where}"])]

@@ -13,9 +13,10 @@ PREFIX = "modes_"  # of the names of figures, before that of a node's estimates
 
 
 def draw_modes_of_nodes(record: Record, kind: str, nodes: Sequence[str]) -> dict[str, Figure]:
-    """Return {name: figure} of the modes' probabilities, for each node with a filter that weighs modes.
+    """Return {file name: figure} of the modes' probabilities, for each node with a filter that estimates modes.
 
-    The name consists of "modes_" (PREFIX), `kind` and the node's index.
+    The file name is "modes_KIND_i" with the node's index i in `nodes`; `kind` is "estimates" or "smoothed". The modes
+    are the states of a Markov chain that switches the model.
     """
     figures = {}
     for i, node in enumerate(nodes):
@@ -27,7 +28,7 @@ def draw_modes_of_nodes(record: Record, kind: str, nodes: Sequence[str]) -> dict
 @matplotlib.rc_context(LOOK)
 def _draw_modes(record: Record, node: str) -> Figure:
     """Draw the probabilities of the modes over time, by the filters of one node."""
-    figure, grid = make_stacked_panels(1, 2.2, 0.8)
+    figure, grid = make_stacked_panels(1, height=2.2, margin=0.8)
     record.plot_modes(node, axes=grid[0])
     place_legend_above(figure, grid[0], columns=3)
     label_time_axis(record, grid[0])

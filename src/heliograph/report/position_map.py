@@ -15,7 +15,7 @@ from heliograph.simulation.results.record import Record
 PAIRS = (("x", "y"), ("east", "north"), ("e", "n"), ("px", "py"), ("pos_x", "pos_y"), ("position_x", "position_y"),
          ("x_position", "y_position"), ("lon", "lat"), ("longitude", "latitude"))  # fmt: skip
 ELLIPSES = 12  # of the claimed covariance along the path
-SIGMAS = 2.0
+SIGMAS = 2.0  # semi-axes of an ellipse, in claimed deviations
 
 
 def find_coordinates(states: Sequence[str]) -> tuple[int, int] | None:
@@ -46,7 +46,8 @@ def draw_position_map(record: Record, node: str, names: Sequence[str]) -> Figure
     axes = figure.subplots()
     # For each filter a line, and ellipses at ELLIPSES of its rows if it says what its covariance is.
     for number, name in enumerate(names):
-        estimate, colour = record.estimates[node][name], COLOURS[number % len(COLOURS)]
+        estimate = record.estimates[node][name]
+        colour = COLOURS[number % len(COLOURS)]
         mean = np.asarray(estimate.mean)[:, [i, j]]
         axes.plot(mean[:, 0], mean[:, 1], color=colour, linewidth=1.2, label=quote_for_figure(name))
         if estimate.claim != "none":
@@ -72,7 +73,8 @@ def _draw_ellipse(axes: matplotlib.axes.Axes, center: np.ndarray, covariance: np
     if smaller < 0:
         return
     # Each axis is 2 SIGMAS sqrt(eigenvalue) long; the longer one, along the second eigenvector, is the width.
-    width, height = 2 * SIGMAS * np.sqrt(larger), 2 * SIGMAS * np.sqrt(smaller)
+    width = 2 * SIGMAS * np.sqrt(larger)
+    height = 2 * SIGMAS * np.sqrt(smaller)
     x, y = vectors[:, 1]
     angle = float(np.degrees(np.arctan2(y, x)))
     axes.add_patch(Ellipse((center[0], center[1]), width, height, angle=angle, color=colour, alpha=0.2, linewidth=0))

@@ -4,7 +4,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import rich.console
 import rich.progress
@@ -16,7 +16,7 @@ class Advance(Protocol):
     """Callback that reports which stage begins, or how much of the current one is done."""
 
     def __call__(self, what: str, done: int = 0, total: int = 0) -> None:
-        """Report `done` of `total`, where these are known."""
+        """Report that stage `what` has begun, or that `done` of its `total` are done; total 0 means not known."""
 
 
 @contextmanager
@@ -47,6 +47,13 @@ def progress(stages: int) -> Iterator[Advance]:
         yield advance
 
 
+class _WorkDone(NamedTuple):
+    """How much work was done at a time, in seconds of a clock."""
+
+    done: int
+    time: float
+
+
 class Countdown:
     """Estimate of the remaining time, from the pace after each worker's first piece, which includes compilation.
 
@@ -58,39 +65,37 @@ class Countdown:
     def __init__(self, workers: int = 1, clock: Callable[[], float] = time.monotonic):
         """Begin before any piece of work; `workers` do pieces side by side, and `clock` returns seconds."""
         self.workers, self.clock = workers, clock
-        self.pieces = 0  # how many pieces were done since the first note
-        self.first: int | None = None  # how much was done at the first note
-        # Pairs (how much was done, when): once each worker had done a piece, and at the last note.
-        self.warm: tuple[int, float] | None = None
-        self.last = (0, 0.0)
+        self.pieces = 0  # how many pieces were done since the first call of `note`
+        self.first: int | None = None  # how much was done at the first call of `note`, such as by an earlier process
+        self._newest = _WorkDone(0, 0.0)  # at the last call of `note`
+        # When each worker had done its first piece: from then on the pace counts.
+        self._after_first_pieces: _WorkDone | None = None
 
     def note(self, done: int) -> None:
-        """Record how much is done now; this is called once at the beginning, and then after each piece of work.
-
-        `warm` is set once each worker has done a piece, since first pieces take longer than others.
-        """
-        self.last = done, self.clock()
+        """Record how much is done now; this is called once at the beginning, and then after each piece of work."""
+        self._newest = _WorkDone(done, self.clock())
         if self.first is None:
             self.first = done
         elif done > self.first:
             self.pieces += 1
-        if self.warm is None and self.pieces >= self.workers:
-            self.warm = self.last
+        if self._after_first_pieces is None and self.pieces >= self.workers:
+            self._after_first_pieces = self._newest
 
     def left(self, total: int) -> float | None:
-        """Return the remaining seconds to `total`; None until every worker could do a second piece.
+        """Return the remaining seconds until `total` is done; None until every worker could do a second piece.
 
-        `warm` and `last` are pairs (how much was done, when): after each worker's first piece, and at the last note.
+        The pace is that since each worker's first piece, which takes longer than others. Time that has passed since the
+        last piece is subtracted.
         """
-        if self.warm is None or self.pieces < 2 * self.workers:
+        start, newest = self._after_first_pieces, self._newest
+        if start is None or self.pieces < 2 * self.workers:
             return None
-        (warm_done, warm_time), (done, time) = self.warm, self.last
-        seconds_each = (time - warm_time) / (done - warm_done)
-        return max(seconds_each * (total - done) - (self.clock() - time), 0.0)
+        seconds_each = (newest.time - start.time) / (newest.done - start.done)
+        return max(seconds_each * (total - newest.done) - (self.clock() - newest.time), 0.0)
 
 
 def format_remaining(seconds: float | None) -> str:
-    """Return a remaining time in words: "about 3 min left"; None is unknown."""
+    """Return a remaining time in words, such as "about 3 min left"; None means that it is not known yet."""
     if seconds is None:
         return "time left unknown yet"
     for unit, size in (("h", 3600), ("min", 60)):

@@ -54,8 +54,8 @@ def write_results(
         target: the folder of results.
         stages: number of stages of the computation, for the progress bar.
         compute: the computation, called with the callback that announces a stage.
-        results_of: function from what was computed to its results.
-        needs: packages of extras that are needed in addition to those of `report`.
+        results_of: function from what was computed to its figures, page, summary and further files.
+        needs: optional packages that are needed in addition to those for figures and pages.
 
     Returns:
         The value of `compute`.
@@ -67,7 +67,8 @@ def write_results(
     # Before the long computation: are the packages there, and may the folder be replaced?
     check_installed([*NEEDS, *needs])
     check_replaceable(target)
-    # One stage more than the computation's: writing. The folder appears whole, or not at all.
+    # One stage more than the computation's: writing. `whole_folder` gives a temporary folder, which takes the place of
+    # `target` at the end; after an error `target` is as before.
     with progress(stages + 1) as advance, whole_folder(target) as folder:
         outcome = compute(advance)
         advance("drawing and writing")

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
     from rosbags.interfaces import Connection
 
+# {type of a number: its size in bytes}
 NUMBERS = {f"{kind}{bits}": bits // 8 for kind in ("int", "uint") for bits in (8, 16, 32, 64)}
 NUMBERS |= {"float32": 4, "float64": 8, "bool": 1}
 HEAD = 0x100  # of CDR, little end first: numbers are aligned to their size, counted from after these four bytes
@@ -61,7 +62,8 @@ class MessageLayout:
         field has no fixed position.
         """
         self._definitions, self._data, self._paths = definitions, data, paths
-        self.lengths, self.fields = dict[int, int](), dict[str, tuple[int, str]]()
+        self.lengths = dict[int, int]()
+        self.fields = dict[str, tuple[int, str]]()
         self._note_length(0)
         end = self._locate_message_numbers(begin=4, kind=kind, prefix="")
         has_padding_alone_behind = 0 <= len(data) - end < 4  # a message is filled up to a multiple of four bytes
@@ -71,8 +73,9 @@ class MessageLayout:
     def fits(self, table: np.ndarray) -> np.ndarray:
         """Return for each message of a table of bytes (messages, size) whether it has this layout, (messages,).
 
-        A message has it if all its texts and lists have the same lengths. `self.lengths` maps the first byte of each
-        length to the length, a uint32. Byte 0 holds the four bytes of the encoding's head instead.
+        A message has it if all its texts and lists have the same lengths as those of the message that `self` was made
+        from. `self.lengths` maps the byte where a length stands to the length, a uint32. Byte 0 holds the four bytes of
+        the encoding's head instead.
         """
         has_equal_lengths = np.ones(len(table), dtype=bool)
         for first_byte, length in self.lengths.items():
@@ -80,7 +83,7 @@ class MessageLayout:
         return has_equal_lengths
 
     def read_columns(self, table: np.ndarray) -> dict[str, np.ndarray]:
-        """Return each wanted field of messages of this layout, (messages,)."""
+        """Return {path of a wanted field: its values (messages,)}; `table`: messages of this layout as bytes."""
         return {path: _decode_column(table, begin, kind) for path, (begin, kind) in self.fields.items()}
 
     def _locate_message_numbers(self, begin: int, kind: str, prefix: str) -> int:
@@ -174,14 +177,17 @@ class BatchDecoder:
 
     def __init__(self, reader: "AnyReader", sources: TopicReader):
         """Hold the bag's definitions of messages and the network's sources; no layout of a message is known yet."""
-        self._definitions, self._sources, self._is_ros2 = reader.typestore.fielddefs, sources, reader.is2
+        self._definitions = reader.typestore.fielddefs
+        self._sources = sources
+        self._is_ros2 = reader.is2
         self._layouts = defaultdict[tuple[str, int], list[MessageLayout]](list)
         self.marked = Counter[str]()  # by topic: messages that say that something read of them has no value
 
     def append_events(self, batch: Sequence[RawMessage], table: EventTable) -> bool:
-        """Append the events of messages to a table; False, and nothing is appended, where they need a look at each.
+        """Append the measurements of many messages to a table; return whether that was possible.
 
-        What `TopicReader.read` says of a message at a time is what it gives: the same numbers, in the same order.
+        If it returns False, nothing was appended: the messages have no fixed layout and must be decoded one by one by
+        `TopicReader.read`, which gives the same numbers in the same order.
         """
         try:
             readings, marked = self._read_by_node(batch)
@@ -189,7 +195,7 @@ class BatchDecoder:
             return False
         self.marked += marked
         for node, blocks in readings.items():
-            # In the order in which the messages came.
+            # Blocks are by layout: sort their readings into the order in which the messages came.
             rows = np.concatenate([block.rows for block in blocks])
             order = np.argsort(rows, kind="stable")
             logged = np.array([batch[row].logged for row in rows[order].tolist()], dtype=np.int64)
@@ -204,27 +210,28 @@ class BatchDecoder:
         return True
 
     def _read_by_node(self, batch: Sequence[RawMessage]) -> "tuple[dict[str, list[NodeReadings]], Counter[str]]":
-        """Return the readings of each node, a block for the messages of one topic, size and layout.
+        """Return the readings of each node, and by topic how many messages mark some field as having no value.
 
-        Messages with the same layout have each field at the same byte, so that NumPy reads a field from all of them at
-        once. Also return by topic how many messages mark a field that is read as having no value.
+        A node's readings are a list of blocks, one for the messages of one topic, size and layout: these have each
+        field at the same byte, so that NumPy reads a field from all of them at once.
 
         Raises:
             LayoutNotFixedError: messages that have to be decoded one by one.
         """
         if not self._is_ros2:  # bags of ROS 1 are encoded otherwise
             raise LayoutNotFixedError
-        # By topic and size: the numbers of the messages.
-        groups, results = defaultdict[tuple[str, int], list[int]](list), defaultdict[str, list[NodeReadings]](list)
+        # {(topic, size): indices of its messages in the batch}
+        groups = defaultdict[tuple[str, int], list[int]](list)
         for i, message in enumerate(batch):
             groups[message.connection.topic, len(message.data)].append(i)
-        counts = Counter[str]()
         if FEWEST * len(groups) > len(batch):  # too few of a kind to be worth it
             raise LayoutNotFixedError
-        for (topic, _), numbers in groups.items():
+        results = defaultdict[str, list[NodeReadings]](list)
+        counts = Counter[str]()
+        for (topic, _), members in groups.items():
             # The messages of one topic and size as bytes, (messages, size).
-            table = np.frombuffer(b"".join(batch[i].data for i in numbers), dtype=np.uint8).reshape(len(numbers), -1)
-            connection = batch[numbers[0]].connection
+            table = np.frombuffer(b"".join(batch[i].data for i in members), dtype=np.uint8).reshape(len(members), -1)
+            connection = batch[members[0]].connection
             for rows, fields in self._yield_rows_by_layout(connection, table):
                 # Fields by path (messages,), NaN where a flag says that there is no value.
                 columns, marked = blank_columns(connection.msgtype, fields, self._list_judged_paths(topic))
@@ -233,31 +240,36 @@ class BatchDecoder:
                     # The node, and the indices of its values: one, as `_list_paths_of_numbers` refuses others.
                     ((node, outputs),) = indices.items()
                     size = len(self._sources.names[node])
-                    results[node].append(_make_node_readings(np.array(numbers)[rows], columns, source, outputs, size))
+                    results[node].append(_make_node_readings(np.array(members)[rows], columns, source, outputs, size))
         return results, counts
 
     def _list_judged_paths(self, topic: str) -> set[str]:
-        """Return the paths of a topic's fields that messages may say to have no value."""
-        sources = [source for source, *_ in self._sources.of(topic) if source.valid != {}]
-        return {path for source in sources for path in _list_paths_of_numbers(source)}
+        """Return the paths of a topic's fields that another field (a flag) may declare to have no value.
+
+        A source whose `valid` is {} ignores such flags.
+        """
+        sources = [mapped.source for mapped in self._sources.of(topic)]
+        return {path for source in sources if source.valid != {} for path in _list_paths_of_numbers(source)}
 
     def _yield_rows_by_layout(
         self, connection: "Connection", table: np.ndarray
     ) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
-        """Yield the rows that have one layout, and their wanted fields by path, until all messages are covered.
+        """Yield (rows of `table` of one layout, {path: wanted field (rows,)}) until all messages are covered.
+
+        Layouts are kept for later calls, since most messages of a topic have one of a few layouts.
 
         Args:
             connection: topic and type of the messages.
             table: the messages, all of one size, (messages, bytes).
         """
         known = self._layouts[connection.topic, table.shape[1]]
-        left, index = np.arange(len(table)), 0
-        # One known layout after another; where none is left, a new one by the first message that has none.
+        left, index = np.arange(len(table)), 0  # rows whose layout is not found yet, and the next layout to try
         while len(left):
+            # No known layout fits: make one from the first message that is left.
             if index == len(known):
-                paths = {
-                    path for source, *_ in self._sources.of(connection.topic) for path in _list_paths_of_numbers(source)
-                }
+                paths = set[str]()
+                for mapped in self._sources.of(connection.topic):
+                    paths.update(_list_paths_of_numbers(mapped.source))
                 paths |= list_flags(connection.msgtype, self._list_judged_paths(connection.topic))
                 known.append(MessageLayout(self._definitions, connection.msgtype, table[left[0]].tobytes(), paths))
             fits = known[index].fits(table[left])
@@ -266,16 +278,13 @@ class BatchDecoder:
 
 
 class NodeReadings(NamedTuple):
-    """Readings of a node: numbers of their messages, times (`NONE`: none), counts (-1: none), and values.
+    """Readings of a node as arrays: rows, time and sequence (readings,), values (readings, outputs)."""
 
-    Shapes: rows, time and sequence (readings,), values (readings, outputs).
-    """
-
-    rows: np.ndarray
-    time: np.ndarray
-    sequence: np.ndarray
-    values: np.ndarray
-    period: int
+    rows: np.ndarray  # index of each reading's message in the batch
+    time: np.ndarray  # stamp in nanoseconds; NONE where there is none
+    sequence: np.ndarray  # running count of the sender's messages; -1 where there is none
+    values: np.ndarray  # NaN where there is no value
+    period: int  # after which the running count begins again at 0; 0 if it never does
 
 
 def _list_paths_of_numbers(source: Source) -> list[str]:
@@ -307,7 +316,7 @@ def _make_node_readings(
     messages are read at once, column by column.
 
     Args:
-        rows: numbers of the messages in the bag (messages,).
+        rows: indices of the messages in the batch (messages,).
         columns: {path of a field: its values (messages,)}.
         source: paths, scales and offsets of the values, the time stamp, and the running count, if there is one.
         indices: for each of its values the index among the values that its node receives.
@@ -321,8 +330,8 @@ def _make_node_readings(
     for index, path, scale, offset in zip(indices, source.paths, source.scale, source.offset, strict=True):
         value = _compute_value_column(columns, path)
         values[:, index] = np.where(np.isfinite(value), scale * value + offset, np.nan)
-    # A time stamp of seconds and nanoseconds. It has to be set, so not 0, and of 32 bits, so that the nanoseconds fit
-    # into 64.
+    # A time stamp of seconds and nanoseconds. 0 means that it was not set. Its seconds must have at most 32 bits, so
+    # that the nanoseconds since 1970 fit into 64.
     time = np.full(len(rows), NONE)
     if source.time is not None:
         seconds, nanoseconds = (columns[f"{source.time.path}.{field}"] for field in STAMP)
@@ -340,7 +349,7 @@ def _make_node_readings(
 
 
 def _compute_value_column(columns: dict[str, np.ndarray], path: str | Computed) -> np.ndarray:
-    """Return one value of many messages, (messages,): the field at `path`, or a number computed from several fields.
+    """Return one value of many messages, (messages,): the field at `path`, or a number computed from its `parts`.
 
     `columns` maps the path of a field to its numbers (messages,). A number that is not finite becomes NaN.
 
@@ -356,11 +365,17 @@ def _compute_value_column(columns: dict[str, np.ndarray], path: str | Computed) 
 
 
 def _decode_column(table: np.ndarray, begin: int, kind: str) -> np.ndarray:
-    """Return the number of a kind at byte `begin` of each message of a table of bytes, (messages,)."""
+    """Return the number of type `kind`, such as "uint16", at byte `begin` of each message, (messages,).
+
+    `table` holds the bytes of messages, (messages, size); numbers are encoded little end first.
+    """
     column = np.ascontiguousarray(table[:, begin : begin + NUMBERS[kind]])
     return column.view(np.dtype(kind).newbyteorder("<"))[:, 0]
 
 
 def _align_to_size(begin: int, size: int) -> int:
-    """Return the next byte from this one on that a number of a size may have."""
+    """Return the first byte from `begin` on at which a number of `size` bytes may stand.
+
+    CDR aligns a number to a multiple of its size, counted from behind the head of four bytes.
+    """
     return 4 + -(-(begin - 4) // size) * size

@@ -15,15 +15,19 @@ if TYPE_CHECKING:  # an extra
     from rosbags.rosbag2.storage_mcap import ChunkInfo, McapReader
 
 MESSAGE = 0x05  # kind of a record
-LENGTH = 9  # bytes of a record before its content: kind and length
-CRC = 24  # bytes of a chunk's content before its checksum: first and last time, size
-FIXED = 40  # bytes of a chunk's content before its messages, but for the name of the compression
-HEADER = struct.Struct("<QHIQQ")  # of a message: its length, channel, count, times of logging and publishing
-SIZE, CHECKSUM = struct.Struct("<Q"), struct.Struct("<I")
+RECORD_HEAD = struct.Struct("<BQ")  # begins each record: its kind, and the length of its content
+MESSAGE_HEAD = struct.Struct("<HIQQ")  # begins a message's content: channel, count, times of logging and publishing
+# A chunk's content: first and last time and size (24 bytes), a checksum (4), name of the compression after its length
+# (4), size of the compressed records (8), and these records.
+BYTES_BEFORE_CHECKSUM = 24
+BYTES_BEFORE_RECORDS = 40  # and besides the bytes of the compression's name
+CHECKSUM = struct.Struct("<I")
 
 
 def read_messages_in_order(reader: "AnyReader", connections: "Sequence[Connection]") -> Iterator[RawMessage]:
-    """Yield the messages of connections in the order in which they were logged.
+    """Yield the messages of connections (topics with their types) in the order in which they were logged.
+
+    MCAP files with chunks are read here, since that is faster; any other bag is read by rosbags.
 
     Args:
         reader: an open bag.
@@ -31,13 +35,14 @@ def read_messages_in_order(reader: "AnyReader", connections: "Sequence[Connectio
     """
     from rosbags.rosbag2.storage_mcap import McapReader
 
-    # Of one bag its MCAP file, or files. Anything without chunks, and with each message compressed by itself, is read
-    # by rosbags.
+    # The MCAP file of the bag, or files of a bag in parts; [] for other formats. Files without chunks, and those with
+    # each message compressed by itself, are left to rosbags.
     bag: Any = getattr(reader.readers[0], "storage", None) if len(reader.readers) == 1 else None
     files = [bag] if isinstance(bag, McapReader) else getattr(bag, "storages", [])
     have_chunks = files and all(isinstance(file, McapReader) and file.chunks for file in files)
     if not have_chunks or bag.metadata.compression_mode == "message":
-        yield from (RawMessage(of, logged, bytes(data)) for of, logged, data in reader.messages(connections))
+        for connection, logged, data in reader.messages(connections):
+            yield RawMessage(connection, logged, bytes(data))
         return
     # One file after another, as a bag in parts was written.
     known = {(connection.topic, connection.msgtype): connection for connection in connections}
@@ -63,9 +68,10 @@ def _merge_chunks(
         if earliest_of_later is None:
             yield from waiting
             return
-        count = bisect_left(waiting, earliest_of_later, key=attrgetter("logged"))  # of those before later chunks
-        yield from waiting[:count]
-        waiting = waiting[count:]
+        # Messages before the earliest time of all later chunks are complete, and can be yielded.
+        complete = bisect_left(waiting, earliest_of_later, key=attrgetter("logged"))
+        yield from waiting[:complete]
+        waiting = waiting[complete:]
 
 
 def _yield_messages_of_chunk(
@@ -83,23 +89,25 @@ def _yield_messages_of_chunk(
     """
     from rosbags.rosbag2.storage_mcap import decompress
 
-    # A chunk is a record itself: LENGTH bytes, then its content. CRC bytes into that stands the checksum of its
-    # messages, which `decompress` compares; they begin after FIXED bytes and the name of the compression.
-    stream, content_begin = storage.bio, chunk.chunk_start_offset + LENGTH
+    # A chunk is itself a record, whose content begins after the record's head. Unpack the records in it; `decompress`
+    # also compares their checksum.
+    stream = storage.bio
+    chunk_content = chunk.chunk_start_offset + RECORD_HEAD.size
     assert stream is not None  # since the file is open
-    stream.seek(content_begin + CRC)
+    stream.seek(chunk_content + BYTES_BEFORE_CHECKSUM)
     (checksum,) = CHECKSUM.unpack(stream.read(CHECKSUM.size))
-    stream.seek(content_begin + FIXED + len(chunk.compression))
-    content = decompress(stream.read(chunk.compressed_size), chunk.compression, chunk.uncompressed_size, checksum)
-    # Record after record: a byte for its kind, eight for its length, its content.
-    begin, end = 0, len(content)
-    while begin < end:
-        (size,) = SIZE.unpack_from(content, begin + 1)
-        after = begin + LENGTH + size
-        if after > end:
-            raise ValueError(f"a record of {size} bytes, of which {end - begin - LENGTH} are there")
-        if content[begin] == MESSAGE:
-            _, channel, _, logged, _ = HEADER.unpack_from(content, begin + 1)
+    stream.seek(chunk_content + BYTES_BEFORE_RECORDS + len(chunk.compression))
+    records = decompress(stream.read(chunk.compressed_size), chunk.compression, chunk.uncompressed_size, checksum)
+    # One record after the other: its head (kind and length), then its content.
+    position, end = 0, len(records)
+    while position < end:
+        kind, size = RECORD_HEAD.unpack_from(records, position)
+        content_begin = position + RECORD_HEAD.size
+        content_end = content_begin + size
+        if content_end > end:
+            raise ValueError(f"a record of {size} bytes, of which {end - content_begin} are there")
+        if kind == MESSAGE:
+            channel, _, logged, _ = MESSAGE_HEAD.unpack_from(records, content_begin)
             if channel in channels:
-                yield RawMessage(channels[channel], logged, content[begin + 1 + HEADER.size : after])
-        begin = after
+                yield RawMessage(channels[channel], logged, records[content_begin + MESSAGE_HEAD.size : content_end])
+        position = content_end

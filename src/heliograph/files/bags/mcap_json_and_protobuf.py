@@ -32,8 +32,8 @@ class McapChannel(NamedTuple):
     """A channel of an MCAP file: its topic, how its messages are encoded, and the number of their schema."""
 
     topic: str
-    encoding: str
-    schema: int
+    encoding: str  # JSON, PROTOBUF, one of OTHERS, or of ROS; "" if the file names none
+    schema: int  # of Protocol Buffers it describes the message's type
 
 
 class ProtobufType(NamedTuple):
@@ -73,7 +73,7 @@ def read_mcap_messages(path: Path, sources: TopicReader | None = None) -> Iterat
 
     Args:
         path: the file.
-        sources: the sources, of whose topics alone contents are decoded; None for all topics.
+        sources: sources of measurements; only messages of their topics are decoded. None for all topics.
 
     Raises:
         ValueError: a topic of the sources that is in another encoding; one line.
@@ -101,16 +101,13 @@ def read_mcap_messages(path: Path, sources: TopicReader | None = None) -> Iterat
 
 
 class _StoredMessage(NamedTuple):
-    """A message as it stands in the file: its number from 1, its channel, when it was logged, its bytes, known types.
+    """A message as it stands in the file."""
 
-    `types`: of messages in Protocol Buffers, by the number of their schema.
-    """
-
-    number: int
+    number: int  # among the messages of the file, from 1
     channel: McapChannel
-    logged: int
+    logged: int  # nanoseconds since 1970
     data: bytes
-    types: dict[int, ProtobufType]
+    types: dict[int, ProtobufType]  # types of messages in Protocol Buffers, by the number of their schema
 
 
 def _yield_stored_messages(path: Path, file: BinaryIO, sources: TopicReader | None) -> Iterator[_StoredMessage]:
@@ -120,7 +117,9 @@ def _yield_stored_messages(path: Path, file: BinaryIO, sources: TopicReader | No
         ValueError: a topic of the sources in an encoding that is not read.
         Exception: whatever damage leads to.
     """
-    channels, types, count = dict[int, McapChannel](), dict[int, ProtobufType](), 0
+    channels = dict[int, McapChannel]()
+    types = dict[int, ProtobufType]()
+    count = 0
     for kind, content in _read_records(file):
         if kind == SCHEMA:
             types |= _read_protobuf_schemas(content)
@@ -137,10 +136,16 @@ def _yield_stored_messages(path: Path, file: BinaryIO, sources: TopicReader | No
 
 
 def _decode_payload(where: str, channel: McapChannel, types: dict[int, ProtobufType], data: bytes) -> object:
-    """Return the content of a message: text in JSON, fields in Protocol Buffers, None in other encodings.
+    """Return the content of a message: a text of JSON, a dictionary of Protocol Buffers, None in other encodings.
 
-    `types` maps a schema's number to the message's name and types. If a message cannot be decoded, the error is
-    returned and not raised, so that the reader counts it and goes on.
+    If a message does not fit its schema, the error is returned and not raised, so that the caller counts it and goes
+    on.
+
+    Args:
+        where: place of the message, for the error.
+        channel: topic, encoding and schema number of the message.
+        types: {number of a schema: name and schema of the message's type}.
+        data: the message as it stands in the file.
     """
     if channel.encoding == JSON:
         return data.decode(errors="replace")
@@ -154,7 +159,7 @@ def _decode_payload(where: str, channel: McapChannel, types: dict[int, ProtobufT
 
 
 def _read_protobuf_schemas(content: bytes) -> dict[int, ProtobufType]:
-    """Return {number of the schema: its types} from a schema record.
+    """Return {number of the schema: the message type that it describes} from the content of a schema record.
 
     The answer is {} if the record is damaged or has another encoding than Protocol Buffers. A record consists of the
     schema's number, its name and its encoding (each after its length), and the description of types after its length.
@@ -221,11 +226,11 @@ def _read_records(file: BinaryIO) -> Iterator[tuple[int, bytes]]:
             yield kind, content
             continue
         # A chunk: size and checksum of what it holds, name of the compression, then the size of the compressed bytes.
-        _, _, whole, checksum = PART.unpack_from(content)
+        _, _, size_unpacked, checksum = PART.unpack_from(content)
         compression, at = _read_sized_text(content, PART.size)
-        (packed,) = SIZE.unpack_from(content, at)
-        data = content[at + SIZE.size : at + SIZE.size + packed]
-        yield from _read_records(BytesIO(decompress(data, compression, whole, checksum)))
+        (size_packed,) = SIZE.unpack_from(content, at)
+        packed = content[at + SIZE.size : at + SIZE.size + size_packed]
+        yield from _read_records(BytesIO(decompress(packed, compression, size_unpacked, checksum)))
 
 
 def _read_channel(content: bytes, types: Mapping[int, ProtobufType]) -> tuple[int, McapChannel]:
@@ -243,7 +248,7 @@ def _read_channel(content: bytes, types: Mapping[int, ProtobufType]) -> tuple[in
 
 
 def _read_sized_text(content: bytes, at: int) -> tuple[str, int]:
-    """Return the text whose length stands at byte `at` and which follows it, and the byte after the text."""
+    """Return the text that stands at byte `at`, as its length (4 bytes) and its letters, and the byte after it."""
     (size,) = LENGTH.unpack_from(content, at)
     begin = at + LENGTH.size
     return content[begin : begin + size].decode(), begin + size

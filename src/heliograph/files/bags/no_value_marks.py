@@ -1,4 +1,7 @@
-"""Values of which a message of ROS says itself that they are none, as the definition of its type has it."""
+"""Fields that a message of ROS itself marks as having no value, as the definition of its type says.
+
+A GPS message without a fix, for example, has a latitude, but its status says that it means nothing.
+"""
 
 from collections.abc import Callable, Collection, Mapping
 from typing import Any, NamedTuple
@@ -10,9 +13,10 @@ class Mark(NamedTuple):
     """How messages of a type say that some of their fields have no value.
 
     Attributes:
-        fields: dotted paths of these fields, each with what is in it.
-        flags: dotted paths of the numbers that say so.
-        is_none: from a value and these numbers, or arrays of them, whether it is none.
+        fields: dotted paths of the fields that may have no value; of a list or message all that is in it is meant.
+        flags: dotted paths of the numbers in the same message that decide it.
+        is_none: function of a field's value and the flags, numbers or arrays of equal shape, that returns whether the
+            field has no value.
     """
 
     fields: tuple[str, ...]
@@ -20,30 +24,30 @@ class Mark(NamedTuple):
     is_none: Callable[..., Any]
 
     def covers(self, path: str) -> bool:
-        """Return whether a field is one of these, or in one."""
+        """Return whether the field at a dotted path is one of `self.fields`, or an item of one."""
         return any(path == field or path.startswith(f"{field}.") for field in self.fields)
 
 
 def _is_negative(_value: Any, status: Any) -> Any:
-    """Return whether there is no fix: STATUS_NO_FIX is -1."""
+    """Return whether a satellite receiver had no fix: its status is -1 then (STATUS_NO_FIX), otherwise not negative."""
     return status < 0
 
 
 def _is_minus_one(_value: Any, first: Any) -> Any:
-    """Return whether there is no estimate: the first entry of its covariance is -1."""
+    """Return whether an inertial sensor gave no estimate: the first entry of its covariance is -1 then."""
     return first == -1
 
 
 def _is_out_of_range(value: Any, least: Any, most: Any) -> Any:
-    """Return whether a range is to be discarded: below the least that the sensor knows, or beyond the most.
+    """Return whether a distance is outside the sensor's range, from `least` to `most`.
 
-    Both are 0 where a driver does not tell them.
+    A driver that does not give the limits sets both to 0; then every distance counts.
     """
     return (most > least) & ((value < least) | (value > most))
 
 
 POSITION = ("latitude", "longitude", "altitude")
-# Of the comments in the definitions of the types.
+# {message type: its marks}, as the comments in the definitions of the types say.
 MARKS = {
     "sensor_msgs/msg/NavSatFix": [Mark(POSITION, ("status.status",), _is_negative)],
     "gps_msgs/msg/GPSFix": [Mark((*POSITION, "track", "speed", "climb"), ("status.status",), _is_negative)],
@@ -64,12 +68,18 @@ def list_flags(kind: str, paths: Collection[str]) -> set[str]:
 def blank_columns(
     kind: str, columns: Mapping[str, np.ndarray], judged: Collection[str]
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Return the columns of many messages with NaN for values that do not exist, and which messages have such values.
+    """Return the columns of many messages with NaN for fields without a value, and which messages have such fields.
 
-    Some message types have flags that say that a field has no value (MARKS). `columns` maps the path of a field or flag
-    to its numbers (messages,). Only fields among `judged` are looked at. The second result is a mask (messages,).
+    Args:
+        kind: type of the messages.
+        columns: {path of a field or flag: its numbers (messages,)}.
+        judged: paths of the fields that are looked at; others stay as they are.
+
+    Returns:
+        The columns, and a mask (messages,) of the messages in which some field has no value.
     """
-    blank, marked = dict(columns), np.zeros(len(next(iter(columns.values()), ())), dtype=bool)
+    blank = dict(columns)
+    marked = np.zeros(len(next(iter(columns.values()), ())), dtype=bool)
     for mark in MARKS.get(kind, ()):
         for path in filter(mark.covers, judged):
             is_none = mark.is_none(columns[path], *(columns[flag] for flag in mark.flags))
@@ -108,10 +118,10 @@ def _get(message: Any, path: str) -> Any:
 def _set(message: Any, path: str, value: float) -> None:
     """Set the field of a message at a dotted path; a list is copied, since its memory may belong to the file."""
     *parents, last = path.split(".")
-    if last.isdigit():
+    content: object = value
+    if last.isdigit():  # an item of a list: set the whole list anew
         numbers = np.array(_get(message, ".".join(parents)), dtype=np.float64)
         numbers[int(last)] = value
+        content = numbers
         *parents, last = parents
-        setattr(_get(message, ".".join(parents)) if parents else message, last, numbers)
-    else:
-        setattr(_get(message, ".".join(parents)) if parents else message, last, value)
+    setattr(_get(message, ".".join(parents)) if parents else message, last, content)

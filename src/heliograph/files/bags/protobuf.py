@@ -26,10 +26,10 @@ def _decode_signed(number: int) -> int:
 
 
 class ScalarReader(NamedTuple):
-    """How a type of number is read: its wire type, and what makes the number of it."""
+    """How a type of number is read."""
 
-    wire: int
-    read: Callable[[Any], Any]
+    wire: int  # its encoding: VARINT, FIXED32 or FIXED64
+    read: Callable[[Any], Any]  # makes the number from the bytes of a fixed length, or from the integer of a varint
 
 
 def _make_fixed_reader(layout: str) -> Callable[[bytes], Any]:
@@ -59,11 +59,11 @@ class FieldDescriptor(NamedTuple):
     """A field of a type of Protocol Buffers messages, as the schema describes it.
 
     Args:
-        name: as the schema writes it.
-        kind: its type's number.
-        of: full name of its message or enumeration, "" for others.
+        name: its name.
+        kind: number of its type, as FieldDescriptorProto has it: MESSAGE, ENUM, TEXT, BYTES, GROUP or a key of SCALARS.
+        of: full name of its message or enumeration type, "" for others.
         repeated: whether it is a list.
-        implicit: whether it is 0, false or "" where it is absent.
+        implicit: whether absence from a message means 0, false or "".
     """
 
     name: str
@@ -94,7 +94,8 @@ class ProtobufSchema:
         for file in _list_values_of_field(data, 1):
             syntax = _read_text_field(file, 12)
             package = _read_text_field(file, 2)
-            prefix, implicit = f"{package}." if package else "", syntax == "proto3"
+            prefix = f"{package}." if package else ""
+            implicit = syntax == "proto3"
             for message_type in _list_values_of_field(file, 4):
                 schema._add_message_type(message_type, prefix, implicit)
             for enumeration in _list_values_of_field(file, 5):
@@ -109,8 +110,10 @@ class ProtobufSchema:
             prefix: full name of what it stands in, with a dot.
             implicit: whether an absent field has its default, as in proto3.
         """
-        name, fields = prefix + _read_text_field(data, 1), dict[int, FieldDescriptor]()
+        name = prefix + _read_text_field(data, 1)
+        fields = dict[int, FieldDescriptor]()
         for content in _list_values_of_field(data, 2):
+            # Numbers in the description of a field: 1 name, 3 its number in messages, 4 label, 5 kind, 6 type's name.
             found = {number: value for number, _, value in read_fields(content)}
             # A field of a oneof (9), one declared optional (17) and a message are absent where they are not sent.
             has_presence = 9 in found or found.get(17) == 1 or found[5] == MESSAGE
@@ -122,6 +125,7 @@ class ProtobufSchema:
                 implicit=implicit and not has_presence,
             )
         self.messages[name] = fields
+        # Types that are described within this one: 3 messages, 4 enumerations.
         for number, add in ((3, self._add_message_type), (4, self._add_enum)):
             for content in _list_values_of_field(data, number):
                 add(content, f"{name}.", implicit)
@@ -147,17 +151,18 @@ class ProtobufSchema:
         Args:
             data: the message.
             name: full name of its type.
-            depth: how many messages it stands in.
+            depth: how many messages it stands in; above DEEPEST it is refused, since the bytes may be made to nest.
 
         Raises:
-            ValueError: no such message, or no such type in the schema.
+            ValueError: bytes that are no such message, or a type that is not in the schema.
         """
         if name not in self.messages or depth > DEEPEST:
             raise ValueError(f"no type {name!r} in the schema" if depth <= DEEPEST else "messages nested too deeply")
         fields = self.messages[name]
         content: dict[str, Any] = {f.name: [] if f.repeated else self._choose_default(f) for f in fields.values()
                                    if f.repeated or f.implicit}  # fmt: skip
-        # Repeated fields collect their values, which may be packed in one; of any other field the last value counts.
+        # The message is a sequence of (number of the field, wire type, value). A repeated field collects its values, of
+        # which several may be packed in one; of any other field the last value counts.
         for number, wire, value in read_fields(data):
             field = fields.get(number)
             if field is None:  # of a newer schema
@@ -167,7 +172,9 @@ class ProtobufSchema:
                 content[field.name] += values
             elif values:
                 content[field.name] = values[-1]
-        return {"sec": content["seconds"], "nsec": content["nanos"]} if name == STAMP else content
+        if name == STAMP:  # its type is defined in proto3, so that both fields are there even if they are 0
+            return {"sec": content["seconds"], "nsec": content["nanos"]}
+        return content
 
     def _read_value(self, field: FieldDescriptor, value: Any, depth: int) -> Any:
         """Return a field's value as in JSON: a message is an object, an enumeration's value its name, and bytes None.
@@ -197,15 +204,17 @@ class ProtobufSchema:
 
 
 def read_fields(data: bytes) -> Iterator[tuple[int, int, Wire]]:
-    """Yield number, wire type and raw value of each field of a message.
+    """Yield number, wire type and encoded value of each field of a message, as they stand in its bytes.
+
+    The value is an integer for the wire type VARINT, else bytes.
 
     Raises:
-        ValueError: what is no message.
+        ValueError: the bytes are no message, or one that was cut off.
     """
     at = 0
     while at < len(data):
         key, at = _read_varint(data, at)
-        number, wire = key >> 3, key & 7  # the wire type is the last three bits
+        number, wire = key >> 3, key & 7  # the wire type is in the lowest three bits of the key
         value: Wire
         if wire == VARINT:
             value, at = _read_varint(data, at)
@@ -280,12 +289,15 @@ def _find_wire_type(field: FieldDescriptor) -> int:
 
 
 def _list_values_of_field(data: bytes, wanted: int) -> list[bytes]:
-    """Return the messages or texts in the fields of a number."""
+    """Return the values of all fields with the number `wanted` in an encoded message, if they are bytes.
+
+    Such a value is an encoded message or a text.
+    """
     return [value for number, _, value in read_fields(data) if number == wanted and isinstance(value, bytes)]
 
 
 def _read_text_field(data: bytes, number: int) -> str:
-    """Return the text in the last field of a number; "" where there is none."""
+    """Return the text in the last field with this number in an encoded message; "" if there is no such field."""
     return _decode_text((_list_values_of_field(data, number) or [b""])[-1])
 
 

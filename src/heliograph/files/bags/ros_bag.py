@@ -26,7 +26,7 @@ BAGS = (".mcap", ".db3", ".bag")
 OFTEN = 5000  # messages that are decoded at once, and between two reports of progress
 LARGE = 1 << 22  # bytes that are decoded at once
 LISTED = 8  # topics in one line
-Progress = Callable[[int, int], None]
+Progress = Callable[[int, int], None]  # called with how many messages have been read, and how many there are
 MAGIC = b"\x89MCAP0\r\n"  # how MCAP begins and ends
 DATA_END, FOOTER = 0x0F, 0x02  # records of MCAP that follow the data
 # An end of data without a checksum, and a footer without a summary: all is then found by reading on.
@@ -35,7 +35,7 @@ BLOCK = 1 << 20  # bytes copied at once
 
 
 class BagDamagedError(InputError):
-    """A bag cannot be read beyond a place."""
+    """A bag is damaged, so that nothing can be read beyond some place in it; the message names the place."""
 
 
 def is_bag(path: Path) -> bool:
@@ -63,9 +63,9 @@ def read_bag(
 
     Args:
         path: the bag.
-        sources: the sources.
-        events: the table.
-        progress: called with the numbers of messages read and to be read.
+        sources: for each topic, which fields of its messages are the measurements of which node.
+        events: the table; its `broken` and `notes` are set, too.
+        progress: called with how many messages have been read, and how many there are.
         strict: whether the first message that cannot be read is an error.
 
     Raises:
@@ -84,8 +84,10 @@ def read_bag(
             expected = f"a topic of the sources, {_join_names(sources.topics)}"
             raise fail(f"{path}", expected, f"only {_join_names(counts)}")
         _check_fields_of_sources(path, reader, sources)
-        # Messages become events, many at once where all of them can.
-        total, done, decoder = sum(counts[topic] for topic in used), 0, BatchDecoder(reader, sources)
+        # Decode the messages of a batch all at once if their layouts allow it, else one after another.
+        total = sum(counts[topic] for topic in used)
+        done = 0
+        decoder = BatchDecoder(reader, sources)
         marked = Counter[str]()  # by topic: messages that say that something read of them has no value
         try:
             for batch in group_into_batches(read_raw_messages(path, reader, used)):
@@ -174,7 +176,7 @@ def read_raw_messages(path: Path, reader: "AnyReader", topics: list[str]) -> Ite
     """
     connections = [connection for connection in reader.connections if connection.topic in topics]
     messages = read_messages_in_order(reader, connections) if connections else iter(())
-    types = dict[str, str]()  # of each topic the type of its first message, which all others have to have
+    types = dict[str, str]()  # {topic: type of its first message, which all others must have}
     count, last_logged = 0, 0
     while True:
         try:
@@ -188,7 +190,9 @@ def read_raw_messages(path: Path, reader: "AnyReader", topics: list[str]) -> Ite
             raise BagDamagedError(
                 str(fail(f"{path}, {where}", "a bag without damage", _format_reason(error)))
             ) from None
-        topic, kind, last_logged = message.connection.topic, message.connection.msgtype, message.logged
+        topic = message.connection.topic
+        kind = message.connection.msgtype
+        last_logged = message.logged
         if types.setdefault(topic, kind) != kind:
             where = f"{path}, {topic}, logged at {format_moment(last_logged)}"
             raise BagDamagedError(str(fail(where, f"messages of {types[topic]}, as before", kind)))
@@ -197,9 +201,11 @@ def read_raw_messages(path: Path, reader: "AnyReader", topics: list[str]) -> Ite
 
 
 def group_into_batches(messages: Iterator[RawMessage]) -> Iterator[list[RawMessage]]:
-    """Yield messages in lists of bounded size; an error comes after what was read before it."""
+    """Yield messages in lists of at most OFTEN messages, which end once they have LARGE bytes.
+
+    If reading fails, the messages before the failure are yielded first, and the error is raised then.
+    """
     batch, size, failure = list[RawMessage](), 0, None
-    # Up to so many messages or bytes, or to the end.
     while failure is None:
         try:
             message = next(messages, None)
@@ -251,12 +257,9 @@ def _append_messages(
             table.refuse(fail(where, f"a message of {kind}", _format_reason(error)), strict)
             continue
         # Fields that the message itself marks as not valid become NaN, except where a source asks for none ({}).
-        marked[topic] += blank_message(
-            kind,
-            content,
-            {f for single in sources.of(topic) if single.source.valid != {} for f in single.source.fields},
-        )
-        # Each source of the topic makes an event of it, or says why it cannot.
+        judged = {f for single in sources.of(topic) if single.source.valid != {} for f in single.source.fields}
+        marked[topic] += blank_message(kind, content, judged)
+        # Each source of the topic makes an event of the message, or returns the error that says why it cannot.
         for reading in sources.read(topic, content, topic):
             if isinstance(reading, Unread):
                 where = f"{path}, message {number}, logged at {format_moment(logged)}"
@@ -274,8 +277,10 @@ def list_fields(reader: "AnyReader", kind: str, prefix: str = "", depth: int = 6
     """
     from rosbags.interfaces import Nodetype
 
+    if depth == 0:
+        return
     _constants, fields = reader.typestore.fielddefs.get(kind, ([], []))
-    for name, (node, field_type) in fields if depth else ():
+    for name, (node, field_type) in fields:
         if node == Nodetype.BASE:
             yield prefix + name, str(field_type[0])
         elif node == Nodetype.NAME:  # a message within this one
@@ -292,8 +297,9 @@ def format_moment(nanoseconds: int) -> str:
 def _check_fields_of_sources(path: Path, reader: "AnyReader", sources: TopicReader) -> None:
     """Raise ValueError if a source maps a field that the message type of its topic does not have."""
     for connection in reader.connections:
-        what, fields = f"{path}, {connection.topic}", dict(list_fields(reader, connection.msgtype))
-        needed = [field for source, *_ in sources.of(connection.topic) for field in source.fields if field]
+        what = f"{path}, {connection.topic}"
+        fields = dict(list_fields(reader, connection.msgtype))
+        needed = [field for mapped in sources.of(connection.topic) for field in mapped.source.fields if field]
         if needed and not fields:
             raise fail(what, "a message type that the bag defines", f"{connection.msgtype!r}, which it does not")
         for field in needed:
@@ -318,7 +324,7 @@ def _format_reason(error: Exception) -> str:
 
 
 def _join_names(names: "list[str] | Counter[str]", most: int = LISTED) -> str:
-    """Return the first `most` names, and how many more there are."""
+    """Return names joined by commas: the first `most` of them, and how many more there are."""
     names = list(names)
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 

@@ -24,10 +24,10 @@ Predicted = Mapping[str, "Mapping[str, heliograph.forecasting.Forecast]"]  # by 
 
 
 def estimate_columns(record: Record, predicted: Predicted | None = None) -> dict[str, np.ndarray]:
-    """Return the estimates of a recording as columns, with what was predicted of each row where it is given.
+    """Return {header: column (rows,)} of all estimates of a recording: filtered, smoothed and predicted states.
 
     `predicted`: by node and filter the prediction of each row from the rows before it; None for no such columns. Angles
-    are between -pi and pi, also where the record has them beside a known truth.
+    are written between -pi and pi, although the record may have others (nearest to a known truth).
     """
     columns, angles = [(TIME, record.time)], _find_angles(record)
     # Node and filter are part of a name where there are several of them.
@@ -36,8 +36,8 @@ def estimate_columns(record: Record, predicted: Predicted | None = None) -> dict
     for node, filters in record.estimates.items():
         for name, estimate in filters.items():
             prefix = (f"{node}." if has_several_nodes else "") + (f"{name}." if has_several_filters else "")
-            # Columns of the filtered, smoothed and predicted states of one filter. Smoothed ones may cover the last
-            # rows alone.
+            # Filtered, smoothed and predicted states of one filter. Smoothed ones (an Estimate by node and filter, as
+            # the filtered ones) may cover only the last rows; the rows before them are filled up.
             parts = _make_columns(record.states, record.units, estimate, angles)
             columns += [(prefix + key, values) for key, values in parts]
             smoothed = {} if record.smoothed is None else record.smoothed.estimates.get(node, {})
@@ -81,12 +81,12 @@ def write_estimates(record: Record, path: str | Path, predicted: Predicted | Non
 
 
 def make_column_header(name: str, unit: str | None) -> str:
-    """Return the name of a column, with its unit where there is one."""
+    """Return the header of a column, "NAME (UNIT)", or the name alone if there is no unit."""
     return f"{name} ({unit})" if unit else str(name)
 
 
 def _find_angles(record: Record) -> Angles:
-    """Return which states are angles, of a record that `heliograph.run` returned; of any other none are known."""
+    """Return the indices of the states that are angles; () if the record does not hold its network, as `run` has it."""
     network = getattr(record.origin, "model", None)
     return first(network.plant).angles if isinstance(network, Network) else ()
 
@@ -102,7 +102,8 @@ def _make_columns(
         estimate: mean (rows, n) and covariance (rows, n, n); without covariances (claim "none") only means are shown.
         angles: indices of the states that are angles, shown between -pi and pi.
     """
-    mean, covariance = wrap_angles(np.asarray(estimate.mean), angles), np.asarray(estimate.covariance)
+    mean = wrap_angles(np.asarray(estimate.mean), angles)
+    covariance = np.asarray(estimate.covariance)
     if mean.ndim != 2:
         raise fail("record", "the run over one recording", f"estimates of shape {mean.shape}")
     columns = []
@@ -133,7 +134,11 @@ def _make_columns(
 def _make_predicted_columns(
     predicted: "heliograph.forecasting.Forecast", record: Record
 ) -> list[tuple[str, np.ndarray]]:
-    """Return the columns of what was predicted of each row: means, and deviations where there is a claim."""
+    """Return columns (header, values) of predictions of each row: means, and standard deviations if they are claimed.
+
+    Those of states are named as the states, those of sensors' outputs begin with "output.".
+    """
+    # (beginning of the names, predicted quantities, {name: unit})
     parts = [("", predicted.states, record.units)]
     if predicted.outputs is not None:
         parts.append(("output.", predicted.outputs, units_in(predicted.outputs.names)))

@@ -1,4 +1,7 @@
-"""Events of one node in columns: times, arrivals, running counts and values, and what is doubtful about them."""
+"""Events of one node in columns: times, arrivals, running counts and values, and what is doubtful about them.
+
+An event is a message with measurements. Its running count numbers the sender's messages, so that gaps show losses.
+"""
 
 from array import array
 from collections import Counter
@@ -20,19 +23,22 @@ FEWEST_FALLS = 3  # of a count from one number, before that is taken for its lar
 
 
 class UnsetStampNotes(NamedTuple):
-    """What is said of stamps that were not set."""
+    """What the user is told of events whose time stamp was not set; all empty if there are none."""
 
-    note: str = ""  # on the clock
+    note: str = ""  # a line on the clock
     reason: str = ""  # why events were removed
     removed: int = 0  # how many
 
 
 @dataclass
 class NodeEvents:
-    """Events of one node: times and arrivals in nanoseconds, steps or numbers, counts (-1: none), `size` values each.
+    """Events of one node in columns that grow as messages are read.
+
+    Times of measuring and of arrival are nanoseconds since 1970, numbers of steps, or floats in the network's unit. The
+    running count is -1 where there is none.
 
     Attributes:
-        size: numbers of each event.
+        size: how many values each event has.
         numbers: whether times are floats.
         period: after how many messages the count begins at 0 again; 0 if it does not.
         unread: of the messages that came and are no events, since they could not be read or their stamps were not set:
@@ -51,6 +57,7 @@ class NodeEvents:
     refused: "Counter[Reason]" = field(default_factory=Counter)
 
     def __post_init__(self) -> None:
+        """Begin empty columns of times, of 64-bit floats ("d") or integers ("q")."""
         self.time, self.arrival = (array("d" if self.numbers else "q") for _ in range(2))
 
     def arrays(self) -> tuple[np.ndarray, np.ndarray, Int[np.ndarray, " events"]]:
@@ -59,9 +66,9 @@ class NodeEvents:
 
     def keep_events(self, which: np.ndarray) -> None:
         """Keep only the events of the mask `which`, (events,)."""
-        time_arrival_sequence, kept_values = self.arrays(), self.value_matrix()[which]
+        kept_values = self.value_matrix()[which]
+        kept_columns = [column[which] for column in self.arrays()]
         # NumPy's name of 64-bit integers is "l" on some systems, that of `array` is "q".
-        kept_columns = [column[which] for column in time_arrival_sequence]
         self.time, self.arrival, self.sequence = (array(c.dtype.char.replace("l", "q"), c) for c in kept_columns)
         self.values = array("d", kept_values.ravel())
 
@@ -70,7 +77,10 @@ class NodeEvents:
         return np.array(self.values).reshape(len(self.time), self.size)
 
     def note_unread(self, unread: Unread, arrival: float | None) -> None:
-        """Note an unread message: why, and its count at its time, else its arrival, else the newest event's time."""
+        """Note a message that came but could not be read, so that its running count is not taken for a lost one.
+
+        Its moment is its time of measuring, else its arrival, else the newest event's time.
+        """
         if isinstance(unread.error, RefusedError):
             self.refused[unread.error.reason] += 1
         reading = unread.counted
@@ -97,9 +107,14 @@ class NodeEvents:
     def write_losses_before_events(
         self, table: Float[np.ndarray, "rows received"], rows: np.ndarray, counts: Int[np.ndarray, " events"]
     ) -> None:
-        """Write into the last column of `table` how many messages were lost before each event.
+        """Write into the last column of `table` how many messages were lost before each event, by the running counts.
 
-        Only NaN is replaced, where the message did not say it. `counts` are the running counts of the events in `rows`.
+        Only NaN is replaced, where the message itself did not say the number.
+
+        Args:
+            table: values by row, the last of them the number of losses.
+            rows: row of each event (events,).
+            counts: running count of each event.
         """
         lost = np.diff(counts, prepend=counts[:1]) - 1.0
         lost[lost < 0] = np.nan  # not known of the first message, nor after a restart
@@ -108,9 +123,10 @@ class NodeEvents:
         table[rows[to_fill], -1] = lost[to_fill]
 
     def describe_doubtful_count(self, name: str) -> list[str]:
-        """Return a line if a count begins at 0 again sooner than its bits say, and one if it stands still.
+        """Return a line if the running count begins at 0 again before `period`, and one if messages repeat a count.
 
-        It begins sooner than its `period` if it fell three times or more, each time from 2^b - 1. `name`: of the node.
+        It begins again too early if it fell at least three times, each time from the same number 2^b - 1 below the
+        period: the counter has b bits, fewer than the source says. `name`: of the node.
         """
         if not self.period or not len(self.time):
             return []
@@ -120,7 +136,8 @@ class NodeEvents:
         order = np.lexsort((sequence, time))
         counts, differences = sequence[order], np.diff(sequence[order])
         # Whether the largest number is all ones in fewer bits than were said, and each fall is from it.
-        largest, before_falls = int(counts.max()), counts[:-1][differences < 0]
+        largest = int(counts.max())
+        before_falls = counts[:-1][differences < 0]
         bits = largest.bit_length()
         is_all_ones = largest + 1 == 1 << bits and largest + 1 < self.period
         if is_all_ones and len(before_falls) >= FEWEST_FALLS and np.all(before_falls == largest):
@@ -136,21 +153,26 @@ class NodeEvents:
         return lines
 
     def list_lost_digits(self, name: str) -> list[str]:
-        """Return a line if most events share their stamp with others, as if stamps had lost digits; else nothing."""
+        """Return a line if stamps seem to have lost digits, so that two events or more share each on average; else [].
+
+        Fewer than four events are not judged.
+        """
         count, distinct = len(self.time), len(np.unique(np.array(self.time)))
         return [f"{name}: {count} events have {distinct} stamps"] if count > 3 and 2 * distinct <= count else []
 
     def drop_unset_stamps_in_place(self, name: str) -> UnsetStampNotes:
-        """Remove the events whose stamps were not set; return what is to be said of that. `name`: name of the node.
+        """Remove the events whose stamps were not set; return what the user is told. `name`: name of the node.
 
-        A stamp (time of measuring) that is more than a year before its arrival was not set. Where most are, stamps and
-        arrivals are of two clocks: nothing is removed, and each event arrives when it was measured. Where no arrivals
-        are known, a stamp was not set if it is more than a year away from both neighbours, which are near each other.
+        A stamp (time of measuring) that is more than a year before its arrival was not set. If most are, stamps and
+        arrivals are of two clocks: nothing is removed, and arrivals are replaced by the times of measuring. If no
+        arrivals are known, a stamp was not set if it is more than a year away from both neighbours, which are near each
+        other.
         """
-        time, arrival, _ = self.arrays()
-        delays, year = arrival - time, YEAR / SECOND if self.numbers else YEAR  # numbers are seconds
+        time, arrival, _sequence = self.arrays()
         if not len(time):
             return UnsetStampNotes()
+        delays = arrival - time
+        year = YEAR / SECOND if self.numbers else YEAR  # numbers are seconds, other times nanoseconds
         if np.median(delays) > year:
             self.arrival = array(self.time.typecode, self.time)
             two_clocks = "stamps and arrivals are of two clocks: each event arrives when it was measured"
@@ -169,12 +191,13 @@ class NodeEvents:
         return UnsetStampNotes(reason=str(why), removed=count)
 
     def _note_unset(self, unset: Bool[np.ndarray, " events"], are_arrivals_known: bool) -> None:
-        """Note events whose stamps are not set as unread messages, with their counts and the moments they came.
+        """Note events whose stamps are not set (mask `unset`) in `self.unread`: the moments they came, their counts.
 
         If arrivals are not known, the moment is the time of the last earlier event with a stamp, or else of the first.
         """
         time, moments, sequence = self.arrays()
         if not are_arrivals_known:
+            # Index of the last event up to each one whose stamp was set; -1 if there is none.
             last_set = np.maximum.accumulate(np.where(unset, -1, np.arange(len(time))))
             first_set = np.argmin(unset)
             moments = time[np.where(last_set < 0, first_set, last_set)]
@@ -201,4 +224,5 @@ def node_counts_losses(network: Network, name: str) -> bool:
     node = network.nodes[name]
     if not isinstance(node, Node) or node.trigger is None or node.trigger.losses != "numbered":
         return False
-    return node.trigger.side_information(len(node.outputs)) == 1  # numbers on losses that come after the values
+    # How many numbers on losses a message has behind its values.
+    return node.trigger.side_information(len(node.outputs)) == 1

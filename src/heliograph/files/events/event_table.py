@@ -42,8 +42,8 @@ class EventTable:
     Where the network counts steps, times are steps and events arrive at once; with the seconds of a `step` times are
     moments, each of the step that is nearest, counted from the first.
 
-    An event is named by its node, its time and its count; without a count those of equal time are told apart by their
-    order of arrival.
+    An event is identified by its node, its time and its running count; without a count, events of equal time are
+    distinguished by their order of arrival.
 
     Args:
         network: the network.
@@ -61,14 +61,16 @@ class EventTable:
     def __init__(self, network: Network, step: float | None = None, start: int | None = None, numbers: bool = False):
         """Begin without events; `step`: seconds of a step; `start`: time of step 0; `numbers`: times are not dates."""
         instance("network", network, Network, "a Network")
-        self.network, self.steps, self.numbers, self.start = network, TIME_STEP not in network.inputs, numbers, start
+        self.network, self.numbers, self.start = network, numbers, start
+        self.steps = TIME_STEP not in network.inputs  # whether the network counts steps
         self.step = None if step is None else round(scalar("step", step, 1 / SECOND) * SECOND)  # in nanoseconds
-        self._plants: dict[str, dict[str, NodeEvents]] = {}
-        self.notes: list[str] = []
-        self.broken = ""
+        self._plants: dict[str, dict[str, NodeEvents]] = {}  # columns by plant and node
+        # What is reported of the reading.
+        self.notes, self.broken = list[str](), ""
         self.refused, self.reasons = 0, list[str]()
 
     def __len__(self) -> int:
+        """Return how many events there are, of all plants and nodes and of inputs."""
         return sum(len(columns.time) for plant in self._plants.values() for columns in plant.values())
 
     @property
@@ -131,7 +133,7 @@ class EventTable:
         values: Float[np.ndarray, "events size"],
         period: int,
     ) -> None:
-        """Append readings of a node as `add` does one after another; `NONE` is no time, -1 no count."""
+        """Append readings of a node, as `add` does with one; a time NONE means no time, a sequence -1 no count."""
         columns = self._columns_of_plant("")[node]
         time = np.where(time == NONE, arrival, time)
         for column, moments in ((columns.time, time), (columns.arrival, time if self._times_are_steps else arrival)):
@@ -141,7 +143,7 @@ class EventTable:
         columns.period = period
 
     def note_unread(self, unread: Unread, arrival: float | None) -> None:
-        """Note count and reason of a message that could not be read, where its node is known."""
+        """Note the running count of a message that could not be read, and why, if its node is known."""
         if unread.counted is not None:
             self._columns_of_plant(unread.counted.plant)[unread.counted.node].note_unread(unread, arrival)
 
@@ -163,7 +165,8 @@ class EventTable:
         if strict:
             raise error
         self.refused += 1
-        self.reasons += [str(error)] if len(self.reasons) < 3 else []
+        if len(self.reasons) < 3:
+            self.reasons.append(str(error))
 
     def finish(self, source: str, strict: bool = False) -> None:
         """End the reading of a source: leave out events whose time stamp was not set, and note what was left out.
@@ -178,13 +181,14 @@ class EventTable:
         Raises:
             ValueError: no event, and a message that could not be read; a stamp that was not set.
         """
-        by_node = [of_node for plant in self._plants.values() for of_node in plant.items()]
-        if self.dated or not self.steps:  # step numbers are no stamps
+        by_node = [item for columns_by_node in self._plants.values() for item in columns_by_node.items()]
+        if self.dated or not self.steps:
             for name, columns in by_node:
                 self._leave_out_unset_stamps(f"{source}, {name}", columns, strict)
-        # Without an event the first thing that went wrong is the error.
-        if not len(self) and (first := (*self.reasons, self.broken)[0]):
-            raise InputError(first)
+        # Nothing could be read: raise the first refused message's reason, or else why reading ended early.
+        first_trouble = self.reasons[0] if self.reasons else self.broken
+        if not len(self) and first_trouble:
+            raise InputError(first_trouble)
         if not self.steps:
             self.notes += [line for name, columns in by_node for line in columns.list_lost_digits(f"{source}, {name}")]
 
@@ -195,7 +199,8 @@ class EventTable:
             ValueError: there is such an event, where reading is strict.
         """
         unset = columns.drop_unset_stamps_in_place(name)
-        self.notes += [unset.note] if unset.note else []
+        if unset.note:
+            self.notes.append(unset.note)
         self.notes += columns.describe_doubtful_count(name)
         if unset.reason:
             self.refuse(InputError(unset.reason), strict)
@@ -226,7 +231,7 @@ class EventTable:
 
     @property
     def _unit(self) -> int:
-        """Return how many units of the columns one unit of time has."""
+        """Return how many units of the columns make one unit of time: 10^9 nanoseconds a second, else 1."""
         return 1 if self.steps or self.numbers else SECOND
 
     @property
@@ -241,7 +246,9 @@ class EventTable:
 
     def sort_events(self) -> Iterator[Event]:
         """Yield events in order of arrival; times are seconds from the origin, steps, or numbers as they are."""
-        events, matrices, names = self._sort_by_arrival(), self._list_value_matrices(), [*self.network.names, INPUTS]
+        events = self._sort_by_arrival()
+        matrices = self._list_value_matrices()
+        names = [*self.network.names, INPUTS]
         origin, unit = self.origin, self._unit
         # `event_index` counts the node's events. The times are integers, so that their differences are exact.
         for node, time, arrival, sequence, event_index in zip(*(column.tolist() for column in events), strict=True):
@@ -250,8 +257,10 @@ class EventTable:
 
     def lateness(self) -> dict[str, Float[np.ndarray, " events"]]:
         """Return for each node with events how long each took to arrive, in seconds or time's unit, sorted by time."""
+        if self._times_are_steps:  # then nothing is known of arrivals
+            return {}
         lateness, unit = {}, 1 if self.numbers else SECOND
-        for name in () if self._times_are_steps else self.network.names:
+        for name in self.network.names:
             time, arrival, _sequence = self.columns[name].arrays()
             if len(time):
                 lateness[name] = ((arrival - time) / unit)[np.argsort(time, kind="stable")]
@@ -269,7 +278,7 @@ class EventTable:
         laws, unit = {}, 1 if self.numbers else SECOND
         for name, delays in self.lateness().items():
             length = self.step / SECOND if step is None and self.step is not None else step
-            if length is None:
+            if length is None:  # take the median interval; numbers of steps are 1 apart
                 time, _arrival, _sequence = self.columns[name].arrays()
                 intervals = np.diff(np.unique(time))
                 counts_steps = self.numbers and self.steps
@@ -308,7 +317,7 @@ class EventTable:
         return counts
 
     def recording(self, window: float = np.inf, ahead: float = AHEAD) -> Recording:
-        """Return the events that a timeline uses as rows in order of their times; a repeated event counts once.
+        """Return the events that a `live.Timeline` uses as rows in order of time; a repeated event counts once.
 
         If time counts steps, or if nodes share a channel, all events of a time are one row, else each is one. An input
         holds from its event to the next, and is 0 before the first. A row has the inputs of the interval up to it:
@@ -321,7 +330,8 @@ class EventTable:
         Raises:
             ValueError: no events, several plants, steps beyond ten million.
         """
-        return self.rows(window, ahead)[0]
+        recording, _has_message = self.rows(window, ahead)
+        return recording
 
     def rows(self, window: float = np.inf, ahead: float = AHEAD) -> tuple[Recording, Bool[np.ndarray, " rows"]]:
         """Return the recording, and whether each of its rows has a message of a node: other rows have inputs alone.
@@ -337,7 +347,7 @@ class EventTable:
         events = events.select(verdicts == USED)
         if not len(events.time):
             raise fail("events", "at least one that is used", "none")
-        # In order; inputs, of number -1, first at each time.
+        # In order of time; of one time the inputs, whose node number is -1, come first.
         events = events.select(np.lexsort((events.sequence, events.node, events.time)))
         if self.steps and events.time[-1] >= MOST_STEPS:  # each step is a row
             raise fail("time of an event", f"a step below {MOST_STEPS:,}", int(events.time[-1]))

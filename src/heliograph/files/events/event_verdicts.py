@@ -1,4 +1,7 @@
-"""Verdicts on events as arrays: used, a copy, late, in the future; those that a timeline gives one after another."""
+"""Verdicts on events (used, a copy, late, in the future), for all events of a recording at once, as arrays.
+
+They equal those of `live.Timeline`, which judges one event after another as they arrive.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
@@ -14,29 +17,34 @@ USED, DUPLICATE, CONFLICT, LATE, FUTURE = map(VERDICTS.index, ("used", "duplicat
 
 
 class EventsByArrival(NamedTuple):
-    """Events in order of arrival, (events,) each: node (-1: inputs), time, arrival, count, index among its node's."""
+    """Events in order of arrival, as columns (events,)."""
 
-    node: np.ndarray
-    time: np.ndarray
+    node: np.ndarray  # index of the node; -1 for events of the plant's inputs
+    time: np.ndarray  # of measuring
     arrival: np.ndarray
-    sequence: np.ndarray
-    event_index: np.ndarray
+    sequence: np.ndarray  # running count of the node's messages
+    event_index: np.ndarray  # index of the event among those of its node, as they were read
 
     def select(self, which: np.ndarray) -> "EventsByArrival":
-        """Return some of the events, by number or by mask."""
+        """Return some of the events; `which` holds their indices, or is a mask (events,)."""
         return EventsByArrival(*(column[which] for column in self))
 
     def convert_to_steps(self, first: int, step: int) -> "EventsByArrival":
-        """Return the events with times and arrivals as the nearest steps, of length `step` from `first` on."""
+        """Return the events with times and arrivals as numbers of the nearest steps, rounded up in the middle.
+
+        `first` is the moment of step 0 and `step` the length of a step, both in the unit of the times.
+        """
         time, arrival = ((moments - first + step // 2) // step for moments in (self.time, self.arrival))
         return self._replace(time=time, arrival=arrival)
 
 
 def sort_by_arrival(columns: Mapping[str, NodeEvents]) -> EventsByArrival:
-    """Return the events in order of arrival; those without a count are told apart by their order at a time.
+    """Return the events of all nodes in order of arrival.
+
+    Events without a running count get one: how many events of the same node and time arrived before.
 
     Args:
-        columns: the events of the inputs, whose number is -1, and then of each node.
+        columns: the events of the inputs, whose node number is -1, and then of each node, numbered from 0.
 
     Raises:
         ValueError: no events.
@@ -61,7 +69,7 @@ def judge_events(
     window: float,
     ahead: float,
 ) -> Int[np.ndarray, " events"]:
-    """Return the number of the verdict on each event, among `VERDICTS`: the first that holds.
+    """Return the verdict on each event as its index in `VERDICTS`.
 
     An event is a node's message, with time, arrival and running count; all events of a time, or one alone, make a row.
     It is in the future if its time is later than its arrival by more than `ahead`. It is late if its row was final
@@ -95,7 +103,7 @@ def judge_events(
     contenders = np.flatnonzero(has_rivals[row_and_node] & (row >= newest_final))
 
     def values(i: int) -> np.ndarray:
-        """Return the values of event number i."""
+        """Return the values of the event with index i in `events`."""
         return np.asarray(values_by_node[events.node[i]][events.event_index[i]])
 
     _judge_repeated_events(
@@ -116,14 +124,14 @@ def _judge_repeated_events(
 
     Args:
         verdicts: verdicts on all events, such as USED, changed here to DUPLICATE (same values) or CONFLICT (others).
-        numbers: numbers of the events to judge, in order of arrival.
+        numbers: indices of the events to judge, in order of arrival.
         identities: for each, a number for its node, time and count; later events of one identity are repetitions.
         rows_and_nodes: for each, a number that stands for its row and node if rows are joint, else its identity.
-        values: the values of the event with a number.
+        values: function from an event's index to its values.
         joint: whether all events of one time are one row.
     """
-    first_of_identity = dict[int, int]()  # the number of the first event of each identity, which stays
-    filled = dict[int, np.ndarray]()  # by row and node the mask of the components that have a value
+    first_of_identity = dict[int, int]()  # {identity: index of its first event, which stays}
+    filled = dict[int, np.ndarray]()  # {row and node: mask of the components that have a value}
     for event, identity, row_and_node in zip(
         numbers.tolist(), identities.tolist(), rows_and_nodes.tolist(), strict=True
     ):
@@ -174,16 +182,22 @@ def _rank_rows(*columns: np.ndarray) -> Int[np.ndarray, " events"]:
 def _find_newest_final_row(
     events: EventsByArrival, rank: Int[np.ndarray, " events"], window: float
 ) -> Int[np.ndarray, " events"]:
-    """Return for each event the rank of the newest row that is final when it comes, -1 if there is none.
+    """Return for each event the rank of the newest row that is final when the event arrives, -1 if there is none.
 
-    `rank`: number of each event's row. An event of time t is final once another one arrives later than t + window.
+    A row of time t is final once some event arrives later than t + window. Rows are ranked by time.
+
+    Args:
+        events: the events, in order of arrival.
+        rank: rank of each event's row.
+        window: how late an event may be.
     """
     count = len(rank)
     if not np.isfinite(window):
         return np.full(count, -1)
-    # Each event is final from this event on: the first after it whose watermark, arrival - window, is past its time.
+    # `final_from[i]`: index of the first event after i with arrival - window > time[i]; i's row is final from then on.
     watermark = events.arrival - window
     final_from = np.maximum(np.arange(count) + 1, np.searchsorted(watermark, events.time, side="right"))
-    newest_final = np.full(count + 1, -1)  # of the events that become final at each one, and then of all so far
-    np.maximum.at(newest_final, final_from, rank)
-    return np.maximum.accumulate(newest_final[:count])
+    # The greatest rank that becomes final at each event; the last entry is for those that never do.
+    newest_at_event = np.full(count + 1, -1)
+    np.maximum.at(newest_at_event, final_from, rank)
+    return np.maximum.accumulate(newest_at_event[:count])

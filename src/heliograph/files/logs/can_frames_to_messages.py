@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 LISTED = 8  # identifiers in one line
 CODES = 0xFB / 0xFF  # share of the range of a signal's bits from which on a named value is a code, as in J1939
-Database = dict[tuple[int, bool], "Description"]  # by identifier, and whether it has 29 bits
+Database = dict[tuple[int, bool], "Description"]  # {(identifier, whether it has 29 bits): message with its signals}
 
 
 def open_frame_log(path: Path, sources: LogSources, wanted: Wanted) -> Log:
@@ -36,7 +36,9 @@ def open_frame_log(path: Path, sources: LogSources, wanted: Wanted) -> Log:
     """
     database = {} if sources.dbc is None else read_can_database(sources.dbc)
     notes = list[str]()
-    units, kinds, bits = dict[str, dict[str, str]](), dict[str, str](), dict[str, dict[str, int]]()
+    units = dict[str, dict[str, str]]()
+    kinds = dict[str, str]()
+    bits = dict[str, dict[str, int]]()
     for message in database.values():
         signals = message.signals
         units[message.name] = {signal.name: signal.unit or "" for signal in signals}
@@ -47,7 +49,9 @@ def open_frame_log(path: Path, sources: LogSources, wanted: Wanted) -> Log:
 
 
 def read_can_database(path: Path) -> Database:
-    """Return the messages of a database of a bus by their identifiers.
+    """Return the messages that a database of a bus (such as a DBC file) describes, by their identifiers.
+
+    Messages that are containers of others are left out.
 
     Raises:
         ValueError: no such file, or no database of a CAN bus; one line.
@@ -58,7 +62,7 @@ def read_can_database(path: Path) -> Database:
     if not path.is_file():
         raise fail(str(path), "a database of a CAN bus", "a folder" if path.is_dir() else "nothing of that name")
     try:
-        # Signals of real databases overlap.
+        # Not strict, since signals of real databases overlap.
         loaded: Any = database.load_file(path, strict=False)
     except Exception as error:  # whatever a damaged file makes a parser do
         raise fail(str(path), "a database of a CAN bus", error_text(error)) from None
@@ -78,14 +82,14 @@ def find_words(signal: "Signal") -> dict[float, str]:
     is_quantity = signal.unit or signal.scale != 1 or signal.offset != 0
     if not is_quantity or not signal.choices or signal.is_float:
         return {}
-    most = 2 ** (signal.length - signal.is_signed) - 1
-    codes = (-most - 1, most) if signal.is_signed else (math.ceil(CODES * most), most)
+    greatest = 2 ** (signal.length - signal.is_signed) - 1  # raw number that the signal's bits hold
+    least = -greatest - 1  # if it is signed
     words = dict[float, str]()
     for raw, word in signal.choices.items():
         value: Any = signal.conversion.raw_to_scaled(raw, decode_choices=False)
         is_beyond = signal.minimum is not None and value < signal.minimum
         is_beyond |= signal.maximum is not None and value > signal.maximum
-        is_code = raw in codes if signal.is_signed else raw >= codes[0]
+        is_code = raw in (least, greatest) if signal.is_signed else raw >= math.ceil(CODES * greatest)
         if is_beyond or is_code:
             words[value] = str(word)
     return words
@@ -107,7 +111,8 @@ class FrameReader:
 
         `wanted` says by a message's name whether it is read. `notes` gets lines on what was left out.
         """
-        self._path, self._sources, self._database, self._wanted, self._notes = path, sources, database, wanted, notes
+        self._path, self._sources, self._database = path, sources, database
+        self._wanted, self._notes = wanted, notes
         # By a message's name: frames decoded, frames longer than described, sizes of too short frames, and channels.
         self._decoded, self._longer = Counter[str](), Counter[str]()
         self._short: dict[str, Counter[int]] = defaultdict(Counter)
@@ -141,9 +146,9 @@ class FrameReader:
         self._note_left_out()
 
     def _note_left_out(self) -> None:
-        """Append lines on frames left out, on frames longer than the database says, and on words instead of numbers.
+        """Append lines to the notes: on frames left out, frames longer than described, and words instead of numbers.
 
-        The counters are by kind of frame, by message, and by signal and word.
+        The three counters are by kind of frame, by message, and by signal and word.
         """
         if self._left_out:
             counts = ", ".join(f"{kind} ({count})" for kind, count in self._left_out.items())
@@ -156,7 +161,7 @@ class FrameReader:
             self._notes.append(f"{self._path}: words of {self._sources.dbc} in place of numbers, not used: {counts}")
 
     def _decode_frame(self, frame: "Message", moment: float, where: str) -> FileMessage | InputError | None:
-        """Return the message of a frame, or why it cannot be read; None of one that is not wanted.
+        """Return the message in a frame, or the error that says why it cannot be read; None if it is not wanted.
 
         Args:
             frame: the frame.
@@ -179,9 +184,10 @@ class FrameReader:
         return FileMessage(where, name, {STAMP: moment, **signals}, moment)
 
     def _decode_signals(self, frame: "Message", description: "Description", where: str) -> dict[str, Any] | InputError:
-        """Return the signals of a frame by name, None for one that it does not have; or why they cannot be read.
+        """Return {name of a signal: its value, or None if the frame has none}, or the error why it cannot be read.
 
-        `description`: the frame's message as the database has it. Frames of other lengths are counted.
+        A value that is a word, such as "not available", is None, too. Frames of other lengths than described, and such
+        words, are counted. `description`: the frame's message as the database has it. `where`: for errors.
         """
         size, length = len(frame.data), description.length
         if size < length:
@@ -193,7 +199,7 @@ class FrameReader:
             return fail(where, f"what {self._sources.dbc} describes", error_text(error))
         if size > length:
             self._longer[description.name] += 1
-        # Signals that a multiplexed message does not have this time did not arrive.
+        # A multiplexed message has only some of its signals in each frame; the others are None.
         signals: dict[str, Any] = dict.fromkeys(signal.name for signal in description.signals) | decoded
         for name, words in self._words[description.name].items():
             if words and (word := words.get(signals[name])) is not None:
@@ -230,7 +236,7 @@ class FrameReader:
 
 
 def _read_frames(path: Path, sources: LogSources) -> "Iterator[tuple[Message, float] | InputError]":
-    """Yield frames with their moments in seconds since 1970; where the file is damaged the last is an error."""
+    """Yield (frame, its time in seconds since 1970); if the file is damaged, the last item is a `CutOffError`."""
     count = 0
     with ExitStack() as stack:
         try:
@@ -239,7 +245,7 @@ def _read_frames(path: Path, sources: LogSources) -> "Iterator[tuple[Message, fl
             raise
         except Exception as error:  # whatever a damaged file makes a reader do
             raise fail(str(path), "a log of a CAN bus", error_text(error)) from None
-        # Seconds from the file's times to those since 1970; the sources may say when the log began.
+        # What is added to the file's times to get seconds since 1970; `sources.start` is a date that the user gives.
         shift = opened.shift if sources.start is None else sources.start - opened.begin
         frames = iter(opened.reader)
         while True:
@@ -255,11 +261,11 @@ def _read_frames(path: Path, sources: LogSources) -> "Iterator[tuple[Message, fl
 
 
 class _OpenedFrames(NamedTuple):
-    """A reader of frames; the time of the log's begin by it, and what added to its times makes seconds since 1970."""
+    """A log of frames that is open for reading."""
 
     reader: "MessageReader"
-    begin: float
-    shift: float
+    begin: float  # time of the log's begin, as the reader counts times
+    shift: float  # added to the reader's times gives seconds since 1970
 
 
 def _open_frame_reader(path: Path, stack: ExitStack) -> _OpenedFrames:
@@ -314,5 +320,5 @@ def _open_asc(path: Path, stack: ExitStack) -> _OpenedFrames:
 
 
 def _join_names(names: list[str]) -> str:
-    """Return the first LISTED names, and how many more there are."""
+    """Return names joined by commas: the first LISTED of them, and how many more there are."""
     return ", ".join(names[:LISTED]) + (f" and {len(names) - LISTED} more" if len(names) > LISTED else "")

@@ -1,6 +1,6 @@
 """Messages of a vehicle's log for the sources of a network, checked against the signals that the log has."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 
@@ -41,25 +41,39 @@ def open_logs(path: Path, sources: LogSources, wanted: Wanted) -> Log:
             yield from log.messages
             notes.extend(log.notes)
 
-    # By topic the units and bits of the signals that any of the logs has; units that differ stand side by side.
-    units, bits = dict[str, dict[str, str]](), dict[str, dict[str, int]]()
+    bits = dict[str, dict[str, int]]()
+    for log in logs:
+        for topic, bits_of_signal in log.bits.items():
+            bits[topic] = {**bits.get(topic, {}), **bits_of_signal}
+    kinds = {topic: kind for log in logs for topic, kind in log.kinds.items()}
+    return Log(_join_units(logs), kinds, read_one_after_another(), notes, bits)
+
+
+def _join_units(logs: Sequence[Log]) -> dict[str, dict[str, str]]:
+    """Return {topic: {signal: its unit}} of the signals that any of the logs has.
+
+    Units of a signal that differ between logs stand side by side, as "m/s or km/h".
+    """
+    units = dict[str, dict[str, str]]()
     for log in logs:
         for topic, signals in log.units.items():
             known = units.setdefault(topic, {})
             for name, unit in signals.items():
-                several = dict.fromkeys([*known.get(name, "").split(OR), unit])
-                known[name] = OR.join(one for one in several if one)
-        for topic, widths in log.bits.items():
-            bits[topic] = {**bits.get(topic, {}), **widths}
-    kinds = {topic: kind for log in logs for topic, kind in log.kinds.items()}
-    return Log(units, kinds, read_one_after_another(), notes, bits)
+                distinct_units = dict.fromkeys([*known.get(name, "").split(OR), unit])
+                known[name] = OR.join(one for one in distinct_units if one)
+    return units
 
 
 def open_log(path: Path, sources: LogSources, wanted: Wanted) -> Log:
-    """Open a vehicle's log; its format follows from its extension, and only wanted messages are decoded.
+    """Open a vehicle's log; its format follows from its extension.
 
-    ULog files, and MDF files without a database, hold decoded signals. All others hold frames, which a database
-    decodes.
+    ULog files, and MDF files without a database, hold decoded signals. All others hold frames of a CAN bus, raw bytes
+    from which a database of the bus's messages (DBC) decodes signals.
+
+    Args:
+        path: the log.
+        sources: what decodes it: the database, the channel of the bus, and when the log began.
+        wanted: function that returns whether messages of a name are to be decoded.
 
     Raises:
         ValueError: there is no such file, it cannot be opened, or it holds frames and there is no database.
@@ -76,7 +90,7 @@ def open_log(path: Path, sources: LogSources, wanted: Wanted) -> Log:
 
 
 def read_log(path: Path, table: object, sources: TopicReader, notes: list[str]) -> Iterator[FileMessage | InputError]:
-    """Yield the messages of a log that sources ask for, in order of time, or why one cannot be read.
+    """Yield the messages of a log that sources ask for, in order of time; an error in place of one that is unreadable.
 
     A log is a vehicle's or bus's file of signals over time; sources say which signals are a node's values. The logs in
     a folder are read one after another. Each message that is asked for must be in one of them.
@@ -94,14 +108,15 @@ def read_log(path: Path, table: object, sources: TopicReader, notes: list[str]) 
     given = table if isinstance(table, LogSources) else LogSources({})
     log = open_logs(path, given, lambda name: bool(sources.of(name)))
     where = str(path) if given.dbc is None else f"{path} by {given.dbc}"
-    # The units of the signals that are used, for the notes; it raises if a signal is missing.
+    # The units of the signals that are used, for the notes; this raises ValueError if a signal is missing.
     used = _find_signal_units(where, path, log, sources)
     yield from log.messages
     notes += log.notes
     if path.is_dir():
         used_files = (*list_logs(path), given.dbc)
         other_files = [file.name for file in sorted(path.iterdir()) if file not in used_files]
-        notes += [f"{path}: not read beside logs: {', '.join(other_files[:LISTED])}"] if other_files else []
+        if other_files:
+            notes.append(f"{path}: not read beside logs: {', '.join(other_files[:LISTED])}")
     if used:
         notes.append(f"{where}: in the file's units, before scale= and offset=: {', '.join(used)}")
 

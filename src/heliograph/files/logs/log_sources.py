@@ -64,10 +64,13 @@ class LogSources(Mapping[str, "Source | Sequence[Source]"]):
         self.start = None if start is None else parse_start("LogSources, start", start) / SECOND
 
     def __getitem__(self, name: str) -> "Source | Sequence[Source]":
+        """Return the source, or sources, of the message with this name."""
         return self._sources[name]
 
     def __iter__(self) -> Iterator[str]:
+        """Yield the names of the messages that have sources."""
         return iter(self._sources)
 
     def __len__(self) -> int:
+        """Return how many messages have sources."""
         return len(self._sources)

@@ -16,7 +16,9 @@ RAW = "CAN_DataFrame"  # the signal that frames of a bus are recorded as
 
 
 def open_mdf(path: Path, sources: LogSources, wanted: Wanted) -> Log:
-    """Open an MDF4 file; a message is a sample of a channel group, named as the group's acquisition or "group N".
+    """Open an MDF4 file: channel groups, each with signals that are sampled together.
+
+    A message is one sample of a group, and is named as the group's acquisition or "group N".
 
     Args:
         path: the file, a vehicle's log of signals by channel group.
@@ -61,11 +63,11 @@ def _name_groups(file: "MDF") -> list[str]:
 
 
 def _list_channels(file: "MDF", group: int) -> dict[str, int]:
-    """Return the index of each signal of the group with this number, by name, without its channel of times.
+    """Return {name: index} of the signals of the group with this number, without its channel of times.
 
-    A further signal of one name has its index added to it.
+    If two signals have the same name, the index is added to the second's name.
     """
-    index_of_times = file.masters_db.get(group)
+    index_of_times = file.masters_db.get(group)  # asammdf's {group: index of the channel with the samples' times}
     channels: Any = file.groups[group].channels
     indices = dict[str, int]()
     for index, channel in enumerate(channels):
@@ -75,14 +77,16 @@ def _list_channels(file: "MDF", group: int) -> dict[str, int]:
 
 
 def _read_group(file: "MDF", group: int, indices: dict[str, int]) -> MessageSeries:
-    """Return the times, in seconds, and the signals of a group; `indices` holds their indices in it, by name.
+    """Return the samples of a group: times in seconds from the file's start, and the values of each signal.
 
-    A sample that the file marks as invalid becomes None. A signal with several numbers per sample is left out.
+    `indices` maps the name of a signal to its index in the group. A sample that the file marks as invalid becomes None.
+    A signal with several numbers per sample is left out.
     """
     time, values = np.zeros(0), dict[str, np.ndarray]()
     for name, index in indices.items():
         signal = file.get(group=group, index=index, ignore_invalidation_bits=True)
-        time, samples = np.asarray(signal.timestamps, dtype=np.float64), np.asarray(signal.samples)
+        time = np.asarray(signal.timestamps, dtype=np.float64)
+        samples = np.asarray(signal.samples)
         if samples.ndim > 1 or samples.dtype.names:
             continue
         column = np.char.decode(samples, errors="replace") if samples.dtype.kind == "S" else samples

@@ -40,15 +40,16 @@ def open_ulog(path: Path, sources: LogSources, wanted: Wanted) -> Log:
     except Exception as error:  # whatever a damaged file makes a reader do
         raise fail(str(path), "a ULog file", error_text(error)) from None
     topics = {data.name if data.multi_id == 0 else f"{data.name}.{data.multi_id}": data for data in file.data_list}
-    # For each topic the units of its fields, "" since a ULog file does not say them; for wanted topics also the values
-    # of the fields over time.
+    # Units of the fields by topic, all "" since a ULog file does not have them; of wanted topics also the values of the
+    # fields over time.
     units = {name: dict.fromkeys((field for field in data.data if field != STAMP), "") for name, data in topics.items()}
     series = {
         name: MessageSeries(data.data[STAMP] * MICROSECOND, {field: data.data[field] for field in units[name]})
         for name, data in topics.items()
         if wanted(name)
     }
-    # When the device began to run, in seconds since 1970; the sources may say when the log began, some time later.
+    # When the device began to run, in seconds since 1970. The user may give the date when the log began; the log says
+    # how many microseconds after the start of the device that was.
     begin = _find_start_date(file)
     if sources.start is not None:
         begin = sources.start - file.start_timestamp * MICROSECOND

@@ -17,7 +17,7 @@ FRAMES, MDF, ULOG = (".blf", ".asc", CANDUMP), (".mf4",), (".ulg",)
 LOGS = (*FRAMES, *MDF, *ULOG)
 PACKAGES = {**dict.fromkeys(FRAMES, ("can", "cantools")), ".mf4": ("asammdf",), ".ulg": ("pyulog",)}
 DIGITS = 6  # of a second: doubles of our years tell microseconds apart
-Wanted = Callable[[str], bool]
+Wanted = Callable[[str], bool]  # from the name of a message, whether it is to be decoded
 
 
 class Log(NamedTuple):
@@ -58,24 +58,23 @@ def list_logs(path: Path) -> list[Path]:
 
 
 def merge_series(path: Path, begin: float, series: Mapping[str, MessageSeries]) -> Iterator[FileMessage]:
-    """Yield the messages of several series in order of time.
+    """Yield the messages of several series in order of time; each gets its time as the field STAMP.
 
     Args:
-        path: the log, for the messages' places.
-        begin: when it begins, in seconds since 1970.
-        series: by name of their messages.
+        path: the log, for the places of messages in errors.
+        begin: moment from which the times of the series count, in seconds since 1970.
+        series: {name of the messages: their times and values}.
     """
-    # All messages one series after another: time, number of the series, and row in it.
+    # All messages, one series after another: time, index of the series, and row in it.
     names = list(series)
-    times = np.concatenate([np.zeros(0), *(each.time for each in series.values())])
     sizes = [len(each.time) for each in series.values()]
-    series_numbers = np.repeat(np.arange(len(names)), sizes)
-    rows = np.concatenate([np.zeros(0, dtype=int), *(np.arange(size) for size in sizes)])
-    # By series the names of its signals, and their values.
-    fields = [list(each.values) for each in series.values()]
-    columns = [[values.tolist() for values in each.values.values()] for each in series.values()]
+    times = np.concatenate([np.zeros(0), *(each.time for each in series.values())])
+    series_of_message = np.repeat(np.arange(len(names)), sizes)
+    row_of_message = np.concatenate([np.zeros(0, dtype=int), *(np.arange(size) for size in sizes)])
+    # Of each series {signal: its values as a list}.
+    columns = [{name: values.tolist() for name, values in each.values.items()} for each in series.values()]
     for number, index in enumerate(np.argsort(times, kind="stable").tolist(), 1):
-        of, row = series_numbers[index], rows[index]
+        which, row = series_of_message[index], row_of_message[index]
         moment = round(begin + float(times[index]), DIGITS)
-        content = {name: column[row] for name, column in zip(fields[of], columns[of], strict=True)}
-        yield FileMessage(f"{path}, message {number}", names[of], {STAMP: moment, **content}, moment)
+        signals = {name: column[row] for name, column in columns[which].items()}
+        yield FileMessage(f"{path}, message {number}", names[which], {STAMP: moment, **signals}, moment)

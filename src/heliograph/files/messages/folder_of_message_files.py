@@ -31,7 +31,10 @@ def list_message_files(folder: Path) -> list[Path]:
 
 
 def find_topic_of_file(path: Path, sources: TopicReader) -> str:
-    """Return the topic of a file's messages that name none."""
+    """Return the topic of those messages of a file that name none: a form of the file's name.
+
+    It is the full name if a source has it as a topic, else the name without ".gz".
+    """
     return path.name if sources.of(path.name) else make_default_topic(path)
 
 
@@ -41,7 +44,7 @@ def list_used_files(folder: Path, sources: TopicReader) -> list[Path]:
 
 
 def read_message_folder(folder: Path, sources: TopicReader) -> Iterator[FileMessage | InputError]:
-    """Yield the messages of the files whose topics sources read, file by file, or why one cannot be read.
+    """Yield the messages of the files that sources read, file by file; an error in place of an unreadable message.
 
     A file's topic follows from its name, unless its messages have topics of their own.
 
@@ -79,6 +82,6 @@ def describe_unused_files(folder: Path, sources: TopicReader) -> list[str]:
 
 
 def _join_names(names: list[str]) -> str:
-    """Return the first LISTED names, and how many more there are."""
+    """Return names joined by commas: the first LISTED of them, and how many more there are."""
     more = f" and {len(names) - LISTED} more" if len(names) > LISTED else ""
     return f"{', '.join(names[:LISTED])}{more}"

@@ -15,7 +15,7 @@ from heliograph.numerics.times.dates import parse_instant
 TOPIC, PAYLOAD = "topic", "payload"  # of a message in a log
 ARRIVALS = ("arrival", "tst")  # fields that say when a message of a log arrived; `mosquitto_sub -F %j` has the second
 CLOCKS = ("timestamp", "time", "ts")  # the same, where they are dates with a zone or seconds, beside a payload
-YEARS = 1e9, 1e10  # seconds since 1970 of 2001 to 2286
+YEARS = 1e9, 1e10  # seconds since 1970 of the years 2001 and 2286
 LINES = (".jsonl", ".ndjson", ".json", ".log", ".txt")
 # A date or seconds, a topic and a payload, as `mosquitto_sub -F "%I %t %p"` and `mosquitto_sub -v` print them.
 LOGGED = re.compile(r"(?:(?P<arrival>\d{4}-\d\d-\d\dT\S+|\d+(?:\.\d+)?) )?(?P<topic>[^\s{}\[\]\",]+) (?P<payload>.*)")
@@ -68,7 +68,7 @@ def read_parquet_names(path: Path) -> list[str]:
 
 
 def read_message_file(path: Path) -> Iterator[FileMessage | InputError]:
-    """Yield the messages of a file, or why one cannot be read, in the order of the file.
+    """Yield the messages of a file in its order; an error stands in place of a message that cannot be read.
 
     If the file is damaged or was cut off, the last item is a `CutOffError`. Files with an extension in LINES hold JSON
     or the output of MQTT clients. Other files are CSV or Parquet.
@@ -86,7 +86,10 @@ def read_message_file(path: Path) -> Iterator[FileMessage | InputError]:
 
 
 def parse_log_line(text: str) -> tuple[str, str, str | None] | None:
-    """Return topic, payload and arrival of a line that an MQTT client printed; None for any other."""
+    """Return (topic, payload, arrival) of a line that an MQTT client printed; None for any other line.
+
+    The arrival, a date or seconds, is None if the line has none.
+    """
     match = LOGGED.fullmatch(text.strip())
     return None if match is None else (match["topic"], match["payload"], match["arrival"])
 
@@ -197,7 +200,7 @@ def _make_message_of_json(where: str, content: object, doubled: str | None) -> F
 
 
 def _read_csv_messages(path: Path) -> Iterator[FileMessage | InputError]:
-    """Yield the messages of the rows of a CSV file, or why one cannot be read."""
+    """Yield the message of each row of a CSV file; an error stands in place of a row that cannot be read."""
     for row in read_csv_rows(path, marked=True):
         yield row if isinstance(row, InputError) else make_message_of_row(row.where, convert_cells(row))
 

@@ -1,4 +1,7 @@
-"""Messages of a recording, a bag or a file of someone else's making, to events by the sources of a network."""
+"""Messages of a recording (a bag, a log, a file or a store) to events, by the sources of a network.
+
+A source says which fields of the messages of a topic are the measurements of which node.
+"""
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -112,7 +115,8 @@ def read_events(
     """
     instance("network", network, Network, "a Network")
     check_progress(progress, "(read, total)")
-    strict, ignore_unknown = flag("strict", strict), flag("ignore_unknown", ignore_unknown)
+    strict = flag("strict", strict)
+    ignore_unknown = flag("ignore_unknown", ignore_unknown)
     checked = None if sources is None else TopicReader(sources, network)
     # By what the recording is: bags and logs, then messages in our own form, or of the sources' topics.
     if isinstance(source, Path) and is_bag(source):
@@ -137,13 +141,14 @@ def read_events(
 
 
 def _read_bags(path: Path, sources: TopicReader, progress: Progress | None, strict: bool) -> EventTable:
-    """Return the events of a bag, or of the bags in a folder, with messages of ROS or in JSON."""
+    """Return the events of a bag, or of the bags in a folder, with messages of ROS, in JSON or in Protocol Buffers."""
     events = EventTable(sources.network, sources.step_seconds)
     for bag in parts_of(path) or [path]:
         if holds_messages(bag):
             topics = _append_messages_by_topic(bag, read_mcap_messages(bag, sources), sources, events, strict)
             missing = [topic for topic in sources.topics if not set("+#") & set(topic) and topic not in topics]
-            events.notes += [f"{bag}: not in the bag: {', '.join(missing)}"] if missing else []
+            if missing:
+                events.notes.append(f"{bag}: not in the bag: {', '.join(missing)}")
         else:
             read_bag(bag, sources, events, progress, strict)
     return events
@@ -172,7 +177,7 @@ def _holds_rows_of_own_format(source: Path | StoreTable) -> bool:
 def _yield_messages(
     source: Path | StoreTable, sources: TopicReader | None = None
 ) -> Iterator[FileMessage | InputError]:
-    """Yield the messages of a file, of a folder's files that the sources read, or of a store's table."""
+    """Return the messages of a file, of a folder's files that the sources read, or of a store's table."""
     if isinstance(source, Path) and is_message_folder(source) and sources is not None:
         return read_message_folder(source, sources)
     return read_message_file(source) if isinstance(source, Path) else source.messages()
@@ -214,7 +219,7 @@ def _read_by_topic(path: Path | StoreTable, network: Network, sources: TopicRead
         # What cannot be read is counted with our own form first; at the end with whichever form was used.
         elif isinstance(message, InputError) or (message.topic is None and is_own_message(message.content)):
             own.add(message, strict)
-        elif events is None or sources is None:
+        elif events is None or sources is None:  # both are None together
             raise fail(message.where, "a message in our own form, or sources for its topic", message.topic or "none")
         else:
             _append_message(path, message, sources, events, strict)
@@ -232,7 +237,11 @@ def _read_by_topic(path: Path | StoreTable, network: Network, sources: TopicRead
 
 
 def _read_log(path: Path, table: object, sources: TopicReader, strict: bool) -> EventTable:
-    """Return the events of a vehicle's log; `table` are its sources as the network's file has them."""
+    """Return the events of a vehicle's log.
+
+    `table`: the sources as the user gave them, with what decodes the log (`LogSources`). `sources`: the same, checked
+    against the network.
+    """
     events = EventTable(sources.network, sources.step_seconds)
     _append_messages_by_topic(path, read_log(path, table, sources, events.notes), sources, events, strict)
     return events
@@ -241,7 +250,10 @@ def _read_log(path: Path, table: object, sources: TopicReader, strict: bool) -> 
 def _append_messages_by_topic(
     path: Path, messages: Iterator[FileMessage | InputError], sources: TopicReader, events: EventTable, strict: bool
 ) -> set[str | None]:
-    """Append the events of messages that name their topics, and return these topics."""
+    """Append the events of messages that name their topics, and return these topics.
+
+    An unreadable message is counted (raised if `strict`). A `CutOffError` says where the file is damaged.
+    """
     topics = set[str | None]()
     for message in messages:
         if isinstance(message, CutOffError) and not strict:
@@ -334,13 +346,14 @@ def _append_reading(
 
 
 def _note_left_out(path: Path | StoreTable, sources: TopicReader, events: EventTable) -> None:
-    """Add notes on the messages that were left out to the events.
+    """Add notes to the events on messages and files that were left out, and on clocks and senders of the sources.
 
     Raises:
         ValueError: a field that no message of its topic had, clocks that cannot be joined.
     """
-    if said := sources.describe_absent_field():
-        raise InputError(said)
+    if absent := sources.describe_absent_field():
+        raise InputError(absent)
+    # Topics whose times count from 0 and have no date.
     from_zero = sources.clocks.find_topics_without_dates(str(path))
     if isinstance(path, Path) and is_message_folder(path) and not is_log(path):
         events.notes += describe_unused_files(path, sources)

@@ -1,4 +1,7 @@
-"""Messages in the format of heliograph itself, in tables and lines: a node, its count, a time, and values."""
+"""Messages in the format of heliograph itself, in tables and lines: a node, its running count, a time, and values.
+
+Text and errors call it "our own form", in contrast to messages of other makers, which a source has to describe.
+"""
 
 from collections.abc import Mapping, Sequence, Set
 from pathlib import Path
@@ -29,7 +32,7 @@ from heliograph.simulation.network import Network
 EXACT = 2**53  # up to here doubles hold every whole number
 MOST_REASONS = 3  # that are kept of messages that could not be read
 NODE, SEQUENCE, TIME, ARRIVAL, VALUES, PLANT = "node", "sequence", "time", "arrival", "values", "plant"
-NOTHING = np.zeros(0)
+NOTHING = np.zeros(0)  # values of a message that could not be read
 OWN = (NODE, SEQUENCE, TIME, ARRIVAL, VALUES, INPUTS, PLANT)
 
 
@@ -43,12 +46,12 @@ def holds_events(path: str | Path) -> bool:
 
 
 def is_table_file(path: Path) -> bool:
-    """Return whether a file has rows, by its name."""
+    """Return whether a file is a table, by the extension of its name."""
     return find_extension(path) in (".csv", ".parquet")
 
 
 def is_own_message(content: object) -> bool:
-    """Return whether a decoded message is in our own form."""
+    """Return whether a decoded message is in our own form: it has a node, and a running count, values or inputs."""
     return isinstance(content, Mapping) and NODE in content and bool({SEQUENCE, VALUES, INPUTS} & content.keys())
 
 
@@ -68,15 +71,17 @@ class OwnMessageCollector:
         `used` and `refused` count messages. `reasons` says why the first ones were refused, and `broken` where the file
         was cut off.
         """
-        self.source, self._reader = source, HeliographMessageReader(network, str(source), ignore_unknown, table)
-        self._table: EventTable | None = None
-        self.used, self.refused, self.reasons, self.broken = 0, 0, list[str](), ""
+        self.source = source
+        self._reader = HeliographMessageReader(network, str(source), ignore_unknown, table)
+        self._table: EventTable | None = None  # made with the first event, which shows the kind of the times
+        self.used, self.refused = 0, 0
+        self.reasons, self.broken = list[str](), ""
 
     def add(self, message: FileMessage | InputError, strict: bool) -> None:
-        """Append the events of a message; what cannot be read is refused alone.
+        """Append the events of a message; an error in its place, or one in reading it, is counted.
 
         Raises:
-            ValueError: columns that lack, or that nobody knows; where reading is strict, a message that cannot be read.
+            ValueError: missing or unknown columns of a table; if `strict`, any message that cannot be read.
         """
         try:
             if isinstance(message, InputError):
@@ -92,48 +97,62 @@ class OwnMessageCollector:
                 self.broken = str(error)
                 return
             self.refused += 1
-            self.reasons += [str(error)] if len(self.reasons) < MOST_REASONS else []
+            if len(self.reasons) < MOST_REASONS:
+                self.reasons.append(str(error))
 
     def events(self) -> EventTable:
-        """Return the events that were read, with notes on their times and on what was refused.
+        """Return the events that were read, with notes for the user on doubtful times and counts of what was refused.
+
+        Call it once, after the last message.
 
         Raises:
-            ValueError: no event could be read. The error is that of the first one.
+            ValueError: no event could be read (the error of the first message), or a local clock was set back.
         """
-        if self._table is None:
+        table, reader = self._table, self._reader
+        if table is None:
             raise InputError(self.reasons[0]) if self.reasons else fail(str(self.source), "at least one row", "none")
-        if self._reader.zero:
-            self._table.notes.append(f"{self.source}: times are counted from {self._reader.zero}")
-        if self._reader.rounded is not None:
-            digits = f"from {self._reader.rounded} on times are rounded to the nearest double"
-            self._table.notes.append(f"{self.source}: {digits}, as the first, counted from, is far from them")
-        if is_mix_of_units(self._reader.least, self._reader.most):
-            span = f"from {self._reader.least:.14g} to {self._reader.most:.14g}"
-            self._table.notes.append(f"{self.source}: times {span}: seconds and milliseconds, or such, in one column")
-        if self._reader.local:
-            self._check_local_time(self._table)
-        self._table.refused, self._table.reasons, self._table.broken = self.refused, self.reasons, self.broken
-        return self._table
+        # Integers too large for doubles, such as nanoseconds, are counted from the first one.
+        if reader.zero:
+            table.notes.append(f"{self.source}: times are counted from {reader.zero}")
+        # Some are so far from the first one that even the difference is no exact double.
+        if reader.rounded is not None:
+            digits = f"from {reader.rounded} on times are rounded to the nearest double"
+            table.notes.append(f"{self.source}: {digits}, as the first, counted from, is far from them")
+        # The least and the greatest time differ by a factor like 1000.
+        if is_mix_of_units(reader.least, reader.most):
+            span = f"from {reader.least:.14g} to {reader.most:.14g}"
+            table.notes.append(f"{self.source}: times {span}: seconds and milliseconds, or such, in one column")
+        if reader.local:
+            self._check_local_time(table)
+        table.refused = self.refused
+        table.reasons = self.reasons
+        table.broken = self.broken
+        return table
 
     def _check_local_time(self, table: EventTable) -> None:
-        """Note where a node's dates, which have no zone, go on by an hour more, as local time does in spring.
+        """Note where a node's dates, which have no zone, jump forward by an hour, as local time does in spring.
 
         Raises:
-            ValueError: a node's dates go back by an hour: put in order, messages of two hours would be mixed.
+            ValueError: a node's dates go back by an hour, as in autumn: sorted by time, messages of two hours would be
+                mixed.
         """
-        events = [(plant, *of_node) for plant in table.plants for of_node in table.of(plant).columns.items()]
+        events = [(plant, *item) for plant in table.plants for item in table.of(plant).columns.items()]
         for plant, node, columns in events:
             time, _, sequence = columns.arrays()
             time = time.astype(np.int64).view("datetime64[ns]")
             where = f"{self.source}, {f'plant {plant!r}, ' if plant else ''}{node}, column {TIME!r}"
-            for clock in (time, time[np.argsort(sequence, kind="stable")]):  # as they came, and as they were sent
+            # Times in the order in which messages came, and in the order in which they were sent.
+            for clock in (time, time[np.argsort(sequence, kind="stable")]):
                 if (row := find_clock_set_back(clock)) is not None:
                     raise fail_of_clock_set_back(where, clock, row)
             if (row := find_clock_set_forward(np.sort(time))) is not None:
                 table.notes.append(f"{where}: {describe_clock_set_forward(np.sort(time), row)}")
 
     def _add_message(self, message: FileMessage) -> None:
-        """Add the event of one message to the table, and an event of the inputs if the message holds inputs."""
+        """Add the event of one message to the table, and an event of the inputs if the message holds inputs.
+
+        Of a message whose values cannot be read the running count is noted, and the error is raised.
+        """
         readings_and_arrivals = self._reader.read(message.where, message.content)
         if self._table is None:
             self._table = EventTable(self._reader.network, numbers=bool(self._reader.numbers))
@@ -160,8 +179,8 @@ class HeliographMessageReader:
 
     Attributes:
         numbers: whether times are numbers, and not dates; None before the first.
-        zero: what whole numbers are counted from that doubles could not tell apart; 0 or None for others.
-        rounded: the first whole number that doubles do not hold, where the first of all was small; None of none.
+        zero: the first time, if it is an integer too large for doubles: later ones are counted from it; else 0 or None.
+        rounded: the first integer time whose distance from `zero` is no exact double; None if there is none.
         least: the least time that is a number.
         most: the largest one.
     """
@@ -169,26 +188,26 @@ class HeliographMessageReader:
     def __init__(self, network: Network, source: str, ignore_unknown: bool, table: bool):
         """Prepare to read messages in heliograph's own format; nothing is known yet of their times and columns.
 
-        `components`: names of each node's values. `numbers`: whether times are numbers rather than dates, None before
-        the first. `zero`: the time from which large integer times are counted. `rounded`: the first time whose distance
-        from `zero` is no exact double. `least` and `most`: the range of the times. `_numbered`: nodes whose values
-        may come without a count of lost messages. `_zoned`: whether dates have a zone, None before the first.
-        `_columns`: names of columns that were checked already.
+        The class describes the arguments, and the attributes on times: `numbers`, `zero`, `rounded`, `least`, `most`.
         """
-        self.network, self.source, self._ignore, self._table = network, source, ignore_unknown, table
+        self.network, self.source = network, source
+        self._ignore, self._table = ignore_unknown, table
+        # Names of each node's values, and of the inputs besides the time step.
         self.components = {name: tuple(node.received_names) for name, node in network.nodes.items()}
         self.components[INPUTS] = tuple(name for name in network.inputs if name != TIME_STEP)
-        self.steps = TIME_STEP not in network.inputs
+        self.steps = TIME_STEP not in network.inputs  # whether times are numbers of steps
+        # Nodes whose last value is how many messages were lost, which a message may leave out.
         self._numbered = [name for name in network.names if node_counts_losses(network, name)]
+        # Of the times: not known before the first one.
         self.numbers: bool | None = None
         self.zero: int | None = None
         self.rounded: int | None = None
         self.least, self.most = np.inf, -np.inf
-        self._zoned: bool | None = None
-        self._columns: Set[str] = frozenset()
+        self._zoned: bool | None = None  # whether dates have a zone
+        self._columns: Set[str] = frozenset()  # names of columns that were checked already
 
     def read(self, where: str, row: Mapping[str, Any]) -> list[tuple[Reading | Unread, Any]]:
-        """Return the events of a message, its inputs first, each with its arrival, in the unit of times.
+        """Return (event, arrival) for each event of a message: that of its inputs if it has any, then the node's.
 
         A message in our own form has a node, a count, a time and values; the time of arrival, the plant and inputs that
         were set may be in it too. An event is a `Reading` of a node's values, or of inputs. Where the values cannot be
@@ -199,7 +218,7 @@ class HeliographMessageReader:
             row: its fields.
 
         Raises:
-            HeaderError: columns that lack, or that nobody knows.
+            HeaderError: missing or unknown columns of a table.
             ValueError: a message that cannot be read; one line.
         """
         self._check_columns(where, row)
@@ -231,9 +250,9 @@ class HeliographMessageReader:
         return self._zoned is False
 
     def _check_columns(self, where: str, row: Mapping[str, Any]) -> None:
-        """Raise ValueError at an unknown column, which is most likely misspelt, or at one that lacks.
+        """Raise ValueError if a column is unknown, and so most likely misspelt, or if a required one is missing.
 
-        Of rows with the same columns the first is looked at.
+        Rows with the same columns as the row before are not checked again.
         """
         if row.keys() == self._columns:
             return
@@ -241,8 +260,8 @@ class HeliographMessageReader:
         position = f"{self.source}, header" if self._table else where
         error_type = HeaderError if self._table else InputError
         known = [*OWN, *(name for names in self.components.values() for name in names)]
-        for name in () if self._ignore else row:
-            if name not in known:
+        for name in row:
+            if name not in known and not self._ignore:
                 listed = ", ".join(dict.fromkeys(known))
                 raise error_type(str(fail(position, f"only the columns {listed}", repr(name))))
         for name in (NODE, SEQUENCE, TIME):
@@ -251,7 +270,10 @@ class HeliographMessageReader:
         self._columns = row.keys()
 
     def _read_time(self, cell: Any, where: str, column: str) -> tuple[Any, bool]:
-        """Return a time, in nanoseconds of a date or a number, and whether it is a date; all are of one kind."""
+        """Return a time and whether it is a date; raise ValueError unless all times are of one kind.
+
+        A date is returned in nanoseconds since 1970, another time as a number.
+        """
         name = f"{where}, column {column!r}"
         dated = isinstance(cell, str) and looks_like_date(cell)
         if self.numbers is not None and dated != (not self.numbers):
@@ -282,23 +304,30 @@ class HeliographMessageReader:
                 self.rounded = cell
         if is_step and not (number >= 0 and number.is_integer()):
             raise fail(name, "a step, a whole number from 0", f"{cell} ({OF_STEPS})")
-        self.least, self.most = min(self.least, number), max(self.most, number)
+        self.least = min(self.least, number)
+        self.most = max(self.most, number)
         return number
 
 
 class HeaderError(InputError):
-    """The columns of a file are not those of events."""
+    """The columns of a table are not those of our own form, so that none of its rows can be read."""
 
 
 def _read_event_values(row: Mapping[str, Any], names: Sequence[str], where: str, numbered: bool = False) -> np.ndarray:
-    """Return the values of one event, with NaN for a value that did not arrive.
+    """Return the values of one event, (values,), with NaN for a value that did not arrive.
 
-    They stand in the field `values`, as a list or a text, or each in a field of its own name. If the event is
-    `numbered`, its last value is the number of lost messages. This one may be missing in `values`, since the running
-    count also tells it.
+    Args:
+        row: fields of the message. The values stand in the field `values`, as a list or a text, or each in a field of
+            its own name.
+        names: names of the values, in the order of the result.
+        where: place of the message, for errors.
+        numbered: whether the last value is the number of lost messages. It may be missing in the field `values`, since
+            the running count also tells it, and is NaN then.
     """
     if row.get(VALUES) not in (None, ""):
-        cell, column, is_text = row[VALUES], f"{where}, column {VALUES!r}", isinstance(row[VALUES], str)
+        cell = row[VALUES]
+        column = f"{where}, column {VALUES!r}"
+        is_text = isinstance(row[VALUES], str)
         items: list[Any] = cell.replace(";", " ").split() if is_text else _list_cell_items(cell)
         if numbered and len(items) == len(names) - 1:
             items.append("nan" if is_text else np.nan)
@@ -309,7 +338,7 @@ def _read_event_values(row: Mapping[str, Any], names: Sequence[str], where: str,
 
 
 def _list_cell_items(cell: Any) -> list[Any]:
-    """Return what is in a list or array; anything else as a list of one."""
+    """Return the items of a list, tuple or array; anything else becomes a list of one item."""
     return list(cell) if isinstance(cell, list | tuple | np.ndarray) else [cell]
 
 
@@ -323,13 +352,13 @@ def _parse_whole_number(cell: Any, name: str) -> int:
 
 
 def _parse_number(cell: Any, name: str, may_be_empty: bool = False, text: bool = False) -> float:
-    """Return the number in a cell, NaN of an empty one.
+    """Return the number in a cell; NaN if it is empty and may be; raise ValueError for anything else.
 
     Args:
         cell: the cell.
         name: its place, for errors.
         may_be_empty: whether it may be empty, or a word of that meaning; else that is an error.
-        text: whether a text that reads as a number is one; else it is an error.
+        text: whether a text such as "1.5" counts as a number; else it is an error.
     """
     if may_be_empty and (cell is None or cell == "" or (isinstance(cell, str) and NO_VALUE.fullmatch(cell))):
         return np.nan

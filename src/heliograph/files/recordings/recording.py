@@ -178,7 +178,7 @@ class RowReader:
 
     @property
     def names(self) -> set[str]:
-        """Return the names that a column may have."""
+        """Return the headers that a column of the network's table may have, `time` among them."""
         return {TIME, *self._headers}
 
     @property
@@ -228,7 +228,7 @@ class RowReader:
             raise fail_of_clock_set_back(f"{self.source}, row {cells.numbers[row]}, column {TIME!r}", cells.time, row)
 
     def make_recording(self, cells: RecordingRows, before: RecordingRows | None = None) -> Recording:
-        """Return rows in the order of their times as a recording.
+        """Return rows in the order of their times as a recording; refused rows become steps, if every row is a step.
 
         Args:
             cells: the rows.
@@ -236,19 +236,22 @@ class RowReader:
                 are filled from it.
 
         Raises:
-            ValueError: times that go backwards, a time step that is none.
+            ValueError: times that go backwards, an impossible time step.
         """
-        # The row before goes in first, and its own row is left out at the end.
-        begin = 0 if before is None else 1
-        cells = cells if before is None else join_recording_rows([before, cells])
-        kept = insert_missing_rows(cells.numbers, self.network, 1 if before is None else int(before.numbers[0]))
-        time = kept.fill_times(cells.time)
-        u = _make_inputs(self.network, cells.inputs, time, kept, self.source)
-        measurements = {node: kept.fill(values)[begin:] for node, values in cells.measurements.items()}
+        # The row before goes in first, and is left out of the result (`begin`).
+        begin, first_number = 0, 1
+        if before is not None:
+            begin, first_number = 1, int(before.numbers[0])
+            cells = join_recording_rows([before, cells])
+        # Rows that were refused get a time between their neighbours and NaN as measurements.
+        rows = insert_missing_rows(cells.numbers, self.network, first_number)
+        time = rows.fill_times(cells.time)
+        u = _make_inputs(self.network, cells.inputs, time, rows, self.source)
+        measurements = {node: rows.fill(values)[begin:] for node, values in cells.measurements.items()}
         truth = None
         if cells.truth:  # of some states, or of all; of others it is unknown
             unknown = np.full(len(cells.time), np.nan)
-            states = [kept.fill(cells.truth.get(state, unknown)) for state in self.network.states]
+            states = [rows.fill(cells.truth.get(state, unknown)) for state in self.network.states]
             truth = np.stack(states, axis=1)[begin:]
         return Recording(measurements, u[begin:], time[begin:], truth)
 
@@ -269,11 +272,22 @@ class RowReader:
 
 
 def _make_inputs(
-    network: Network, given: Mapping[str, np.ndarray], time: np.ndarray, rows: "RowsWithMissing", source: str
+    network: Network, given: Mapping[str, np.ndarray], time: np.ndarray, rows: RowsWithMissing, source: str
 ) -> np.ndarray:
-    """Return the inputs (rows, inputs); raise ValueError where times go backwards or a time step is impossible.
+    """Return the inputs (rows, inputs), and warn of doubtful times.
 
-    A missing dt is the difference of the times.
+    An input holds its value in rows that were refused. If the table has no time step dt, the differences of the times
+    are taken.
+
+    Args:
+        network: its inputs.
+        given: columns of the inputs that the table has, one value for each row that was read.
+        time: times of all rows, the refused ones included.
+        rows: of which row that was read each of all rows takes its inputs.
+        source: name of the table, for errors.
+
+    Raises:
+        ValueError: times go backwards, or a time step is impossible.
     """
     row = find_backwards_row(time)
     if row is not None:
@@ -307,35 +321,36 @@ def _warn_of_equal_times(time: np.ndarray, source: str) -> None:
 
 
 def _warn_of_lost_digits(time: np.ndarray, source: str) -> None:
-    """Warn if times are doubles, or of single precision, so large that their steps lost digits."""
+    """Warn if times are floats so large that their steps lost digits."""
     lost = find_lost_digits(time)
     if lost is not None:
+        spacing, step = lost  # of the floats of this size, and of the times
         warnings.warn(
-            f"{source}, column {TIME!r}: steps of {lost[1]:g} between numbers that are multiples of {lost[0]:g}: they "
+            f"{source}, column {TIME!r}: steps of {step:g} between numbers that are multiples of {spacing:g}: they "
             "lost digits; whole numbers, dates, or times from the first row on keep them",
             stacklevel=7,
         )
 
 
 def _warn_of_clock_set_forward(time: np.ndarray, source: str, numbers: np.ndarray) -> None:
-    """Warn if dates go on by an hour more in a row, as local time does in spring; `numbers`: of the rows, from 1."""
+    """Warn if dates jump forward by an hour, as local time does in spring; `numbers`: of the rows, from 1."""
     row = find_clock_set_forward(time)
     if row is not None:
-        said = describe_clock_set_forward(time, row)
-        warnings.warn(f"{source}, row {numbers[row]}, column {TIME!r}: {said}", stacklevel=7)
+        description = describe_clock_set_forward(time, row)
+        warnings.warn(f"{source}, row {numbers[row]}, column {TIME!r}: {description}", stacklevel=7)
 
 
 def _warn_of_mixed_units(time: np.ndarray, source: str, numbers: np.ndarray) -> None:
-    """Warn if times leap by a factor from one row to the next, as from seconds to milliseconds.
+    """Warn if times jump by a factor from one row to the next, as from seconds to milliseconds.
 
     `numbers` are the numbers of the rows, from 1.
     """
     if time.dtype.kind not in "fiu":
         return
     before, after = time[:-1].astype(float), time[1:].astype(float)
-    leaps = np.flatnonzero(is_mix_of_units(before, after))
-    if len(leaps):
-        row = int(leaps[0]) + 1
+    jumps = np.flatnonzero(is_mix_of_units(before, after))
+    if len(jumps):
+        row = int(jumps[0]) + 1
         warnings.warn(
             f"{source}, row {numbers[row]}, column {TIME!r}: {time[row]:.14g} after {time[row - 1]:.14g}: "
             "seconds and milliseconds, or such, in one column",

@@ -51,21 +51,26 @@ class RecordingBlocks:
         progress: Progress | None = None,
     ):
         """Prepare to read a table in blocks; `strict`: a row that cannot be read is an error, else refused alone."""
-        self._path, self._strict, self._block, self._progress = path, strict, block, progress
+        self._path = path
+        self._strict = strict
+        self._block = block
+        self._progress = progress
         self._reader = RowReader(network, str(path), strict, ignore_unknown)
         self._last_number = 0  # of the rows read so far, refused ones included
         self._done, self._total = 0, 0  # how much of the file is read, and of how much, as progress has it
-        # Rows refused, with the first reasons; rows yielded; warnings.
-        self.refused, self.reasons, self.rows, self.doubts = 0, list[InputError](), 0, list[str]()
+        self.refused = 0  # how many rows
+        self.reasons = list[InputError]()  # of the first of them
+        self.rows = 0  # that were yielded
+        self.doubts = list[str]()  # warnings
 
     @property
     def notes(self) -> list[str]:
-        """Return lines on what was put in order."""
+        """Return a line on how many rows were sorted by time, or [] if none were."""
         return self._reader.notes
 
     @property
     def expected_rows(self) -> int:
-        """Return how many rows the file has, as far as the part of it says that is read."""
+        """Return the estimated number of rows of the file: rows read so far, divided by the share of the file read."""
         return round(self._last_number * self._total / max(self._done, 1))
 
     def __iter__(self) -> Iterator[Recording]:
@@ -85,7 +90,8 @@ class RecordingBlocks:
     def _yield_recordings(self, parts: Iterable[TableRows]) -> Iterator[Recording]:
         """Yield parts of a table as recordings, each of which goes on from the last row of the one before it.
 
-        Rows that the reader refused, and warnings on a part (`doubts`), are collected over all parts.
+        Each part is sorted by itself, and `BlockOrderCheck` makes sure that all rows are sorted then. Rows that the
+        reader refused, and warnings on a part (`doubts`), are collected over all parts.
         """
         order = BlockOrderCheck(self._path, self._reader.network)
         for unordered in self._yield_cells(parts):
@@ -104,20 +110,20 @@ class RecordingBlocks:
         order.check_left_out_rows()
 
     def _yield_cells(self, parts: Iterable[TableRows]) -> Iterator[RecordingRows]:
-        """Yield the rows of each part of a table that can be read, as they came; of the first parts at least two rows.
+        """Yield the rows of each part of a table that can be read, as they came.
 
-        A large table is read part by part. Rows at its beginning may be unreadable; where each row is a step, their
-        times follow from the first two readable rows. Then a single first row is held until the next one comes.
+        Rows at the table's beginning may be unreadable. If each row is a step, their times follow from the first two
+        readable rows. So a single readable row at the beginning is held back and joined with the next part.
         """
-        held: RecordingRows | None = None  # while nothing was yielded
-        is_first = True
+        held: RecordingRows | None = None  # rows held back, while nothing was yielded
+        is_first = True  # whether no row was yielded yet
         for rows in parts:
             self._last_number = int(rows.numbers[-1]) if len(rows.numbers) else self._last_number
             if not len(rows.numbers):
                 self._note_refused(rows.refused)
                 continue
             cells = self._reader.read_cells(rows)
-            if held is not None and held.time.dtype != cells.time.dtype:  # which the order of blocks refuses
+            if held is not None and held.time.dtype != cells.time.dtype:  # `BlockOrderCheck` will refuse these
                 yield held
                 held, is_first = None, False
             # The held row goes before these; if they are still too few, both are held.
@@ -138,7 +144,7 @@ class RecordingBlocks:
             self._progress(done, total)
 
     def _note_refused(self, errors: list[InputError]) -> None:
-        """Count rows that were refused, and keep the first reasons."""
+        """Count rows that were refused, and keep the first SHOWN reasons."""
         self.refused += len(errors)
         self.reasons += errors[: SHOWN - len(self.reasons)]
 
@@ -172,7 +178,7 @@ def _join_recordings(parts: list[Recording]) -> Recording:
 
 
 def _select_rows(recording: Recording, rows: slice) -> Recording:
-    """Return some rows of a recording."""
+    """Return the rows of a recording that the slice `rows` selects."""
     measurements = {node: values[rows] for node, values in recording.measurements.items()}
     truth = None if recording.truth is None else recording.truth[rows]
     return Recording(measurements, recording.inputs[rows], recording.time[rows], truth)

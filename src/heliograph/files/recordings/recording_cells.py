@@ -32,13 +32,15 @@ class RowRefusals:
         self.refused = list[InputError]()
 
     def refuse(self, bad: np.ndarray, column: str, expected: str, came: Callable[[int], str]) -> None:
-        """Refuse the rows of a mask that were not refused before; `self.good`, (rows,), marks the rows still accepted.
+        """Refuse the rows of the mask `bad`: note an error for each of them that was not refused before.
+
+        `self.good`, (rows,), marks the rows that are still accepted.
 
         Args:
             bad: the mask, (rows,).
             column: name of the column that is wrong.
             expected: what was expected there.
-            came: returns what stands in a row instead, by the row's index.
+            came: function from a row's index to a description of what stands there instead.
 
         Raises:
             ValueError: a row is refused and reading is strict.
@@ -53,7 +55,7 @@ class RowRefusals:
 
 
 def read_cells(columns: Mapping[str, np.ndarray], network: Network, refusals: RowRefusals) -> RecordingRows:
-    """Return what stands in the columns of a table; rows that cannot be read are refused by `refusals`.
+    """Return the columns of a table as times, measurements, inputs and true states; each cell is checked.
 
     Args:
         columns: the table's cells by name of column, a row for each time.
@@ -65,7 +67,8 @@ def read_cells(columns: Mapping[str, np.ndarray], network: Network, refusals: Ro
     received = list_received_columns(network)
     # A relay may have no columns at all: the filters of other nodes do not need what the relay received, so that only
     # its own filter has no data.
-    for name in () if network.relays is None else network.relays.relays:
+    relays = () if network.relays is None else network.relays.relays
+    for name in relays:
         if not any(column in columns for names in received[name] for column in names):
             del received[name]
     if TIME in inputs:
@@ -83,7 +86,7 @@ def read_cells(columns: Mapping[str, np.ndarray], network: Network, refusals: Ro
     for node, components in received.items():
         found = [_find_column(columns, names, source) for names in components]
         measurements[node] = np.stack([_read_measurements(columns, column, refusals) for column in found], axis=1)
-    # All inputs have to be there, but for a time step dt, which times say too.
+    # All inputs have to be there, except a time step dt, which follows from the times.
     given = {
         name: _read_column_without_gaps(columns, _find_column(columns, (name,), source), refusals)
         for name in inputs
@@ -96,13 +99,16 @@ def read_cells(columns: Mapping[str, np.ndarray], network: Network, refusals: Ro
 
 
 def list_truth_columns(network: Network) -> dict[str, str]:
-    """Return the name of the column of each state's true value, unless a node's component has it."""
+    """Return {state: name of the column of its true value, "truth.STATE"}.
+
+    A state whose name would be that of a node's component has no such column.
+    """
     received = {name for node in list_received_columns(network).values() for names in node for name in names}
     return {state: f"truth.{state}" for state in network.states if f"truth.{state}" not in received}
 
 
 def list_received_columns(network: Network) -> dict[str, list[tuple[str, ...]]]:
-    """Return the allowed column names of each node's components, the preferred one first."""
+    """Return for each node, and each component that it receives, the allowed column names, the preferred one first."""
     names = {node: receiver.received_names for node, receiver in network.nodes.items()}
     # How many things each name may be meant for: one alone may be called by it without its node.
     uses = Counter([TIME, *network.inputs])
@@ -179,5 +185,5 @@ def _read_numbers(columns: Mapping[str, np.ndarray], name: str, source: str) -> 
 
 
 def _describe_cell(values: np.ndarray) -> Callable[[int], str]:
-    """Return a function that says what stands in a row of a column, by the number of the row."""
+    """Return a function from the index of a row to a description of the cell there, for errors."""
     return lambda row: "an empty cell" if find_missing(values[row]) else f"{values[row]}"

@@ -16,23 +16,25 @@ MOST_OUT = 0.5  # share of the rows below which those that are out of order, or 
 
 
 class RecordingRows(NamedTuple):
-    """Rows of time as columns: their numbers from 1, times, measurements by node, inputs and true states by name."""
+    """Rows of a recording as columns, one row for each time."""
 
-    numbers: np.ndarray
-    time: np.ndarray
-    measurements: dict[str, np.ndarray]
-    inputs: dict[str, np.ndarray]
-    truth: dict[str, np.ndarray]
+    numbers: np.ndarray  # of the rows in the table, from 1, (rows,)
+    time: np.ndarray  # numbers or dates, (rows,)
+    measurements: dict[str, np.ndarray]  # by node, (rows, received), NaN where nothing arrived
+    inputs: dict[str, np.ndarray]  # by name, (rows,)
+    truth: dict[str, np.ndarray]  # true values by state, (rows,)
 
     def select(self, good: np.ndarray | slice) -> "RecordingRows":
-        """Return the rows of a mask, of numbers, or of a slice."""
+        """Return some of the rows; `good` is a mask, an array of indices, or a slice."""
+        # The fields behind numbers and time are dictionaries of columns.
         parts = ({name: values[good] for name, values in part.items()} for part in self[2:])
         return RecordingRows(self.numbers[good], self.time[good], *parts)
 
 
 def join_recording_rows(parts: Sequence[RecordingRows]) -> RecordingRows:
     """Return the rows of several parts of a table, one after the other."""
-    numbers, time = np.concatenate([part.numbers for part in parts]), np.concatenate([part.time for part in parts])
+    numbers = np.concatenate([part.numbers for part in parts])
+    time = np.concatenate([part.time for part in parts])
     # The fields after numbers and time are dictionaries of columns by name.
     columns = (
         {name: np.concatenate([part[i][name] for part in parts]) for name in parts[0][i]}
@@ -42,7 +44,7 @@ def join_recording_rows(parts: Sequence[RecordingRows]) -> RecordingRows:
 
 
 def order_rows(cells: RecordingRows, network: Network, source: str) -> tuple[RecordingRows, list[InputError], int]:
-    """Return rows whose times do not go backwards, why others are refused, and how many came after later ones.
+    """Return rows sorted by time, the reasons why other rows are refused, and how many rows came after later ones.
 
     If time is continuous, a time that is more than a year outside of all others was not set: its row is refused, and
     the other rows are put in the order of their times. If each row is a step, as few rows as possible are refused so
@@ -80,12 +82,14 @@ def order_rows(cells: RecordingRows, network: Network, source: str) -> tuple[Rec
 
 
 class RowsWithMissing(NamedTuple):
-    """Rows of a recording, read or missing: of a missing one the values are NaN, and the time lies between those read.
+    """Rows of a recording, of which some were read and others are missing; all attributes have shape (rows,).
+
+    A missing row has NaN as values, and its time lies between those of rows that were read.
 
     Attributes:
-        numbers: their numbers in the table, from 1.
-        read_row: index of the row that was read from which each is taken: its own, or the one before it.
-        arrived: whether it was read itself.
+        numbers: numbers of the rows in the table, from 1.
+        read_row: for each row the index, among the rows that were read, of itself or of the last one before it.
+        arrived: whether the row itself was read.
     """
 
     numbers: np.ndarray
@@ -93,27 +97,23 @@ class RowsWithMissing(NamedTuple):
     arrived: np.ndarray
 
     def fill(self, values: np.ndarray) -> np.ndarray:
-        """Return the values of all rows, with NaN for rows that did not arrive; `values` are of rows that were read.
-
-        `self.read_row` holds for each row the index of the last row that was read up to it.
-        """
+        """Return the values of all rows, with NaN for missing rows; `values` are those of the rows that were read."""
         filled = np.array(values[self.read_row], dtype=np.float64)
         filled[~self.arrived] = np.nan
         return filled
 
     def fill_times(self, time: np.ndarray) -> np.ndarray:
-        """Return the times of all rows; rows that did not arrive are spaced evenly between the others.
+        """Return the times of all rows; missing rows are spaced evenly between the rows that were read.
 
-        Those ahead of the first row that was read go back from it in the steps in which the next one follows. Where
-        only one was read they have its time. `time` holds the times of the rows that were read. `self.read_row` holds
-        for each row the index of the last row that was read up to it.
+        Rows before the first one that was read are extrapolated from the first two. If only one row was read, all have
+        its time. `time` holds the times of the rows that were read.
         """
         missing = np.flatnonzero(~self.arrived)
         filled = np.array(time[self.read_row])
         if len(time) < 2:
             return filled
-        # t = t_before + share (t_after - t_before), between the rows that arrived before and after it; the share is
-        # negative ahead of the first.
+        # t = t_before + share (t_after - t_before), between the rows that were read before and after it; `share` is
+        # negative for rows before the first one.
         before = np.minimum(self.read_row[missing], len(time) - 2)
         numbers = self.numbers[self.arrived]
         share = (self.numbers[missing] - numbers[before]) / (numbers[before + 1] - numbers[before])
@@ -123,10 +123,10 @@ class RowsWithMissing(NamedTuple):
 
 
 def lacks_second_row(cells: RecordingRows, network: Network, source: str) -> bool:
-    """Return whether the times of rows ahead of the first one that can be read need a row that is not among these.
+    """Return whether `cells`, the first readable rows of a table, are too few to date the unreadable rows before them.
 
-    These are rows from the first on, as they came. Without an input dt every row is a step, and of those that did not
-    arrive ahead of the first row the times follow from the first two.
+    If every row is a step (there is no input dt), the times of those rows are extrapolated from the first two readable
+    ones (`RowsWithMissing.fill_times`), so that a single one does not suffice.
     """
     if TIME_STEP in network.inputs or not len(cells.numbers):
         return False

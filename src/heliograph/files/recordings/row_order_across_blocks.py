@@ -35,13 +35,11 @@ class BlockOrderCheck:
     """
 
     def __init__(self, path: Path, network: Network):
-        """Begin without rows; rows are steps if the network has no input dt.
-
-        `_first` and `last` hold the first and the newest row that were kept, of all blocks.
-        """
-        self._path, self._rows_are_steps = path, TIME_STEP not in network.inputs
-        self.last: RecordingRows | None = None
-        self._first: RecordingRows | None = None
+        """Begin without rows; rows are steps if the network has no input dt."""
+        self._path = path
+        self._rows_are_steps = TIME_STEP not in network.inputs
+        self._first: RecordingRows | None = None  # the first row that was kept, of all blocks
+        self.last: RecordingRows | None = None  # the newest one
         self._disordered: RecordingRows | None = None  # two rows, of which the second has an earlier time
         self._jump: RecordingRows | None = None  # two rows that are more than a year apart
         self._left_out = list[RecordingRows]()  # two rows of each block: those with the least and the greatest time
@@ -61,7 +59,8 @@ class BlockOrderCheck:
         """
         # All blocks must have times of one kind (numbers or dates).
         if self.last is not None and self.last.time.dtype != ordered.time.dtype:
-            where, before = f"{self._path}, row {ordered.numbers[0]}, column {TIME!r}", self.last.time.dtype
+            where = f"{self._path}, row {ordered.numbers[0]}, column {TIME!r}"
+            before = self.last.time.dtype
             raise RowsNotInBlocksError(str(fail(where, f"numbers of the kind before, {before}", ordered.time.dtype)))
         # The block must not begin before the last row of the block before it.
         rows = ordered if self.last is None else _join_times(self.last, ordered)
@@ -105,17 +104,18 @@ class BlockOrderCheck:
                     raise self._make_refusal(_join_times(self.last, rows.select(slice(row, row + 1))), "times in order")
 
     def _make_refusal(self, rows: RecordingRows, expected: str) -> RowsNotInBlocksError:
-        """Return the error that names the second of two rows."""
+        """Return the error that names the second of two rows, whose time does not fit that of the first."""
         where = f"{self._path}, row {rows.numbers[1]}, column {TIME!r}"
         return RowsNotInBlocksError(str(fail(where, expected, backwards_text(rows.time, 1))))
 
 
 def _join_times(before: RecordingRows, after: RecordingRows) -> RecordingRows:
-    """Return the numbers and times of rows behind others."""
-    numbers, time = (np.concatenate([before[i], after[i]]) for i in range(2))
+    """Return the rows `before` followed by the rows `after`, with their numbers and times alone."""
+    numbers = np.concatenate([before.numbers, after.numbers])
+    time = np.concatenate([before.time, after.time])
     return RecordingRows(numbers, time, {}, {}, {})
 
 
 def _year_in_unit_of(time: np.ndarray) -> np.timedelta64 | float:
-    """Return a year in the unit of times."""
+    """Return the length of a year in the unit of `time`: a duration for dates, seconds for numbers."""
     return np.timedelta64(YEAR, "ns") if time.dtype.kind == "M" else YEAR / SECOND

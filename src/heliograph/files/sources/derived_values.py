@@ -1,4 +1,8 @@
-"""Values of a message that are computed of several of its fields, or of one that may be absent."""
+"""Values that are computed from several fields of a message, or from one that may be absent.
+
+Each class has `parts`, the dotted paths of the fields, and `of`, a function from their numbers to the value. It works
+on the numbers of one message, or on arrays (messages,) of many.
+"""
 
 from dataclasses import dataclass
 from functools import partial
@@ -77,8 +81,9 @@ class Covariance:
 
     def of(self, *numbers: Any) -> Any:
         """Return the entry ij of a covariance, from numbers or arrays; it is NaN where it is unknown."""
-        # The numbers are in the order of `parts`: the diagonal, entries ij and ji, and the variances ii and jj.
-        diagonal, (entry, mirror, row_variance, column_variance) = numbers[: self.size], numbers[self.size :][:4]
+        # The numbers are in the order of `parts`: the diagonal, entries ij and ji, variances ii and jj, and the kind.
+        diagonal = numbers[: self.size]
+        entry, mirror, row_variance, column_variance = numbers[self.size : self.size + 4]
         # In messages of ROS, nothing is known if the first entry is -1 or if all variances are 0.
         known = np.asarray(diagonal[0]) != -1
         known &= np.any([np.asarray(variance) != 0 for variance in diagonal], axis=0)
@@ -158,18 +163,18 @@ class Geodetic:
 
     @property
     def east(self) -> "PlaneCoordinate":
-        """Return metres east of the origin."""
-        return PlaneCoordinate(self, 0)
+        """Return the value "metres east of the plane's origin", which is computed from each message; axis 0."""
+        return PlaneCoordinate(self, axis=0)
 
     @property
     def north(self) -> "PlaneCoordinate":
-        """Return metres north of the origin."""
-        return PlaneCoordinate(self, 1)
+        """Return the value "metres north of the plane's origin", which is computed from each message; axis 1."""
+        return PlaneCoordinate(self, axis=1)
 
     @property
     def up(self) -> "PlaneCoordinate":
-        """Return metres over the origin's horizontal plane."""
-        return PlaneCoordinate(self, 2)
+        """Return the value "metres above the plane", which is computed from each message; axis 2."""
+        return PlaneCoordinate(self, axis=2)
 
     def covariance(
         self,
@@ -202,18 +207,21 @@ class Geodetic:
         return (self.latitude, self.longitude, *(() if self.height is None else (self.height,)))
 
     def coordinates(self, latitude: Any, longitude: Any, *height: Any) -> tuple[Any, Any, Any]:
-        """Return degrees, degrees and metres of a message's numbers."""
-        above = np.asarray(height[0]) * self.metres if height else self.plane.height
-        return np.asarray(latitude) * self.degrees, np.asarray(longitude) * self.degrees, above
+        """Return (latitude in degrees, longitude in degrees, height in metres) from a message's numbers in its units.
+
+        `height` is left out if the message has none; then it is that of the plane's origin.
+        """
+        metres_high = np.asarray(height[0]) * self.metres if height else self.plane.height
+        return np.asarray(latitude) * self.degrees, np.asarray(longitude) * self.degrees, metres_high
 
 
 @readable
 @dataclass(frozen=True)
 class PlaneCoordinate:
-    """East, north or up of a `Geodetic` position, by its number: a value in place of a path."""
+    """East, north or up of a `Geodetic` position: a value in place of a path."""
 
     position: Geodetic
-    axis: int
+    axis: int  # 0 east, 1 north, 2 up
 
     @property
     def parts(self) -> tuple[str, ...]:
@@ -221,8 +229,9 @@ class PlaneCoordinate:
         return self.position.parts
 
     def of(self, *numbers: Any) -> Any:
-        """Return the coordinate in metres, of numbers or of arrays; NaN where one is missing."""
-        return self.position.plane.to_plane(*self.position.coordinates(*numbers))[..., self.axis]
+        """Return the coordinate in metres, from the numbers at `self.parts`; NaN where one is missing."""
+        east_north_up = self.position.plane.to_plane(*self.position.coordinates(*numbers))
+        return east_north_up[..., self.axis]
 
 
 @readable
@@ -254,14 +263,16 @@ class PlaneCovariance:
         """
         # `numbers` are those of the position, and then those of each entry of the covariance, row by row.
         begin = len(self.position.parts)
-        latitude, longitude, _ = self.position.coordinates(*numbers[:begin])
+        latitude, longitude, _height = self.position.coordinates(*numbers[:begin])
         entries = []
         for entry in self._entries:
             count = len(entry.parts)
             entries.append(entry.of(*numbers[begin : begin + count]))
             begin += count
-        matrix = np.stack(np.broadcast_arrays(*entries), axis=-1).reshape(*np.shape(entries[0]), 3, 3)
-        return self.position.plane.turn_covariance(latitude, longitude, matrix)[(..., *self.row_and_column)]
+        # The covariance (..., 3, 3) in the fix's axes, turned into the plane's.
+        covariance = np.stack(np.broadcast_arrays(*entries), axis=-1).reshape(*np.shape(entries[0]), 3, 3)
+        row, column = self.row_and_column
+        return self.position.plane.turn_covariance(latitude, longitude, covariance)[..., row, column]
 
 
 Computed = Yaw | Covariance | ZeroIfAbsent | PlaneCoordinate | PlaneCovariance

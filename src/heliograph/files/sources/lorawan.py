@@ -12,14 +12,14 @@ RADIO = ("rssi", "snr")  # what a gateway says of how it received an uplink
 
 
 class _UplinkLayout(NamedTuple):
-    """How a LoRaWAN server lays out uplinks: topic, and paths of values, time, frame count, device and reception."""
+    """How a LoRaWAN server lays out uplinks, the messages of radio devices: topic, and dotted paths in its JSON."""
 
     topic: str
-    values: str
-    time: str
-    frames: str
+    values: str  # the decoded payload, in which the measured values are
+    time: str  # when the uplink was received
+    frames: str  # the device's running count of frames
     device: str
-    reception: str
+    reception: str  # how the first gateway received the uplink
 
     def make_sources(
         self, path: "Paths", node: "Name", output: "Texts", scale: float, offset: float, radio: "Texts"
@@ -143,6 +143,9 @@ def chirpstack(
 
 
 def _prefix_paths(prefix: str, path: Paths) -> list[str | Computed]:
-    """Return paths within the part of a message that has the path `prefix`, as paths within the message."""
+    """Return the paths of values in a message from paths in the part of it that stands at the path `prefix`.
+
+    `path`: a dotted path or the `Yaw` of a quaternion, or several of them.
+    """
     paths = read_paths(path)
     return [Yaw(f"{prefix}.{part.path}") if isinstance(part, Yaw) else f"{prefix}.{part}" for part in paths]

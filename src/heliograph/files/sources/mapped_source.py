@@ -14,11 +14,11 @@ NamesByNode = Mapping[str, tuple[str, ...]]  # names of each node's numbers; und
 
 
 class MappedSource(NamedTuple):
-    """A source, the pattern of its topics, and which numbers of a node's measurement its values are, by node."""
+    """A source, checked against the network: its fields are known to be certain numbers of a node's measurement."""
 
     source: Source
-    pattern: str
-    indices_by_node: dict[str, np.ndarray]
+    pattern: str  # its topic, which may have wildcards
+    indices_by_node: dict[str, np.ndarray]  # for each of its values, (values,), the index in the node's measurement
 
 
 def map_sources(topic: object, items: object, names: NamesByNode, time_counts_steps: bool) -> list[MappedSource]:
@@ -42,9 +42,10 @@ def map_sources(topic: object, items: object, names: NamesByNode, time_counts_st
     for source in sources:
         _check_wildcards(topic, source)
         mapped.append(MappedSource(source, topic, _find_output_indices(topic, source, names)))
-        # `of` raises where the topic has not the level that a condition asks for; "#" may be of any levels.
-        for condition in source.available if "#" not in topic else ():
-            condition.of(topic)
+        # `of` raises ValueError if the topic lacks a level that a condition asks for; "#" may stand for any levels.
+        if "#" not in topic:
+            for condition in source.available:
+                condition.of(topic)
         _check_time_unit(topic, source, time_counts_steps)
     return mapped
 
@@ -72,7 +73,8 @@ def _check_time_unit(topic: str, source: Source, time_counts_steps: bool) -> Non
         if time_counts_steps
         else "a time that is no step, since the network's time is continuous"
     )
-    got = f"{show_value(source.time and source.time.path)} in {source.time_unit}"
+    path = None if source.time is None else source.time.path
+    got = f"{show_value(path)} in {source.time_unit}"
     raise fail(f"sources, {topic!r}, time", expected, got)
 
 

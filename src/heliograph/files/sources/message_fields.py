@@ -8,7 +8,7 @@ from decimal import Decimal
 from functools import lru_cache
 from math import isfinite
 from operator import attrgetter
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from heliograph.numerics.times.dates import UNITS, parse_dates, parse_instant
 TimeUnit = Literal["s", "ms", "us", "ns", "step"]
 # Fields of a stamp, of seconds and nanoseconds: of ROS 2 and 1, protobuf, Foxglove.
 STAMPS = (("sec", "nanosec"), ("secs", "nsecs"), ("seconds", "nanos"), ("sec", "nsec"))
-PLAIN = (Mapping, list, tuple, str, int, float, np.ndarray, type(None))
+PLAIN = (Mapping, list, tuple, str, int, float, np.ndarray, type(None))  # any other message is an object of rosbags
 NUMBER = "a number, true or false, or null for what did not arrive"
 EXACT, DIGITS = 2**53, 20  # up to here doubles hold every whole number; as many digits at most have 64 bits
 SHORT = 16  # characters: a double tells apart any two numbers of 15 digits and a point
@@ -42,6 +42,13 @@ class LongDecimal(float):
         self.decimal = Decimal(text)
 
 
+class _DoubledField(NamedTuple):
+    """An object of JSON in which a field occurs twice, as a dictionary, and the field's name."""
+
+    fields: dict[str, Any]
+    name: str
+
+
 class MissingFieldError(InputError):
     """A message has no field at a path."""
 
@@ -56,7 +63,7 @@ def decode_json(text: str | bytes, name: str) -> Any:
     """
     content, doubled = _decode_json(text, name)
     if doubled:
-        raise fail_of_doubled(name, doubled[0][1])
+        raise fail_of_doubled(name, doubled[0].name)
     return content
 
 
@@ -74,24 +81,24 @@ def decode_items(text: str | bytes, name: str) -> list[tuple[Any, str | None]]:
 
 
 def fail_of_doubled(name: str, field: str) -> InputError:
-    """Return the error of an object of JSON that has a field twice, of which decoders use the last."""
+    """Return the error for an object of JSON that has a field twice; decoders would silently use the last one."""
     return fail(name, "distinct fields", f"{field!r} more than once")
 
 
-def _decode_json(text: str | bytes, name: str) -> tuple[Any, list[tuple[dict[str, Any], str]]]:
+def _decode_json(text: str | bytes, name: str) -> tuple[Any, list[_DoubledField]]:
     """Return the content of JSON, and each object in it that has a field twice, with the field's name.
 
     Decoders keep the last of two fields of one name without a word, so the caller refuses such an object. `name`: of
     the text, for errors. Words such as nan or inf, which are no JSON, are read as null.
     """
-    doubled: list[tuple[dict[str, Any], str]] = []
+    doubled = list[_DoubledField]()
 
     def collect(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        """Return an object's fields as a dictionary; if one occurs twice, append (fields, its name) to `doubled`."""
+        """Return an object's fields as a dictionary; if one occurs twice, append the object to `doubled`."""
         fields = dict(pairs)
         if len(fields) < len(pairs):
             names = [name for name, _ in pairs]
-            doubled.append((fields, next(name for name in names if names.count(name) > 1)))
+            doubled.append(_DoubledField(fields, next(name for name in names if names.count(name) > 1)))
         return fields
 
     # First as it is, which is fast; then once more with null for words such as nan outside of quoted texts.
@@ -109,24 +116,28 @@ def _decode_json(text: str | bytes, name: str) -> tuple[Any, list[tuple[dict[str
         raise fail(name, "JSON", show_value(text)) from None
 
 
-def _name_doubled_field(content: Any, doubled: list[tuple[dict[str, Any], str]]) -> str | None:
+def _name_doubled_field(content: Any, doubled: list[_DoubledField]) -> str | None:
     """Return the name of a field that occurs twice in `content` or in an object inside it, or None.
 
-    `doubled` holds the pairs (object, name of its doubled field) that were found while decoding.
+    `doubled` holds the objects with such a field that were found while decoding.
     """
     if not doubled or not isinstance(content, dict | list):
         return None
-    field_of_content = next((field for fields, field in doubled if fields is content), None)
-    if field_of_content is not None:
-        return field_of_content
+    for field in doubled:
+        if field.fields is content:
+            return field.name
     items = content.values() if isinstance(content, dict) else content
-    return next((field for item in items if (field := _name_doubled_field(item, doubled)) is not None), None)
+    names = (_name_doubled_field(item, doubled) for item in items)
+    return next((name for name in names if name is not None), None)
 
 
 def _flatten_lists(content: object) -> Iterator[object]:
-    """Yield each item of a list, or of lists in it; what is no list as the one item."""
-    for item in content if isinstance(content, list) else [content]:
-        yield from _flatten_lists(item) if isinstance(item, list) else [item]
+    """Yield the items of a list, and of lists inside it, one by one; anything but a list is yielded itself."""
+    if not isinstance(content, list):
+        yield content
+        return
+    for item in content:
+        yield from _flatten_lists(item)
 
 
 def match_topic(topic: str, pattern: str) -> bool:
@@ -176,7 +187,7 @@ def field_at(message: object, path: str, where: str) -> Any:
 
 @lru_cache
 def _make_attribute_getter(path: str) -> "attrgetter[Any]":
-    """Return what reads a dotted path of attributes."""
+    """Return a function that reads the attribute at a dotted path of an object; cached, since paths are few."""
     return attrgetter(path)
 
 
@@ -231,10 +242,10 @@ def convert_time(value: Any, unit: TimeUnit, name: str, quoted: bool = False) ->
     """Return a time in nanoseconds since 1970, or as a step if that is its unit.
 
     Args:
-        value: a stamp of two whole numbers, a date with its zone, or a number.
-        unit: of a number.
-        name: of the value, for errors.
-        quoted: whether a number in quotes is one.
+        value: a stamp (seconds and nanoseconds), a date with its zone, or a number.
+        unit: unit of a time that is a number.
+        name: name of the value, for errors.
+        quoted: whether a text such as "1.5" counts as a number.
 
     Raises:
         ValueError: no time; a date without a zone; a stamp of zero, which nobody has set.
@@ -326,7 +337,7 @@ def convert_count(value: Any, name: str, quoted: bool = False) -> int:
 
 
 def convert_name(value: Any, name: str) -> str:
-    """Return the name of a plant or a node as a text; it may be a whole number."""
+    """Return the name of a plant or a node as a text; `value` may be an integer, `name` is its place, for errors."""
     if isinstance(value, int | np.integer) and not isinstance(value, bool):
         return str(int(value))
     if isinstance(value, float) and value.is_integer():
@@ -337,7 +348,7 @@ def convert_name(value: Any, name: str) -> str:
 
 
 def _list_field_names(value: object) -> str:
-    """Return the names of a value's fields for an error; the value itself where it has no fields."""
+    """Return the names of a value's fields, for an error, in at most 200 letters; a value without fields itself."""
     if isinstance(value, Mapping):
         names = [str(key) for key in value]
     elif hasattr(value, "__dataclass_fields__"):

@@ -45,9 +45,9 @@ class Unread(NamedTuple):
 
 
 def is_allowed(value: object, allowed: Container[object]) -> bool:
-    """Return whether a field's value is among those that are allowed; a flag is there also as a word, such as "True".
+    """Return whether a field's value is among those that are allowed.
 
-    Cells of tables in text are flags where they say so.
+    A flag (True or False) is also allowed as a word: "True", "true" or "TRUE", since a table of text has words for it.
     """
     if not isinstance(value, bool):
         return value in allowed

@@ -17,14 +17,12 @@ class SenderCounter:
     """Counts the values of fields that are named as a sender's name is, in messages read as one node of one plant."""
 
     def __init__(self) -> None:
-        """Begin with no message.
-
-        `_counts` counts how often each value came, by (topic, plant, node, field). `_names` says for each field whether
-        it names a sender. `_noted` counts messages, and `_said` holds what was warned of.
-        """
+        """Begin with no message."""
+        # By (topic, plant, node, field): how often each value of the field came.
         self._counts: dict[tuple[str, str, str, str], Counter[object]] = defaultdict(Counter)
-        self._names: dict[str, bool] = {}
-        self._noted, self._said = 0, set[tuple[str, str]]()
+        self._names: dict[str, bool] = {}  # {field: whether its name is that of a sender}
+        self._noted = 0  # messages
+        self._said = set[tuple[str, str]]()  # (topic, field) that were warned of
 
     def note_fields(self, topic: str, plant: str, node: str, message: object, asked: Collection[str]) -> None:
         """Count the fields of a message that was read as one of a node of a plant.
@@ -34,7 +32,9 @@ class SenderCounter:
         senders apart already, or they are values.
         """
         self._noted += 1
-        for name, value in message.items() if isinstance(message, Mapping) else ():
+        if not isinstance(message, Mapping):
+            return
+        for name, value in message.items():
             if isinstance(value, str | int) and name not in asked and self._is_sender_name(name):
                 counts = self._counts[topic, plant, node, name]
                 if len(counts) <= MANY:
@@ -42,12 +42,13 @@ class SenderCounter:
 
     def describe_at_powers_of_two_messages(self) -> list[str]:
         """Return what `describe_several_senders` does after 1, 2, 4, 8, ... messages; [] in between, to save time."""
+        # n & (n - 1) is 0 for a power of two alone.
         return self.describe_several_senders() if self._noted & (self._noted - 1) == 0 else []
 
     def describe_several_senders(self) -> list[str]:
-        """Return a line for each field of a topic that has several values which come again; each is returned once.
+        """Return a line for each field of a topic that seems to name several senders; each is returned once.
 
-        That the values of a field come again, twice on average, is how names of several senders look.
+        Such a field has 2 to MANY different values, and each came at least twice on average.
         """
         found: dict[tuple[str, str], list[object]] = {}
         for (topic, _, _, name), counts in self._counts.items():

@@ -33,7 +33,7 @@ class Level:
     names: Mapping[str, str] | None = None
 
     def of(self, topic: str, message: object, where: str) -> str:
-        """Return the topic's level number `self.index`, replaced by its name in `self.names` if there is one."""
+        """Return the topic's level number `self.index`, or its name in `self.names`. `where`: place for errors."""
         levels = topic.split("/")
         if not -len(levels) <= self.index < len(levels):
             raise fail(where, f"a topic with a level {self.index}", repr(topic))
@@ -55,7 +55,7 @@ class Field:
     names: Mapping[str, str] | None = None
 
     def of(self, topic: str, message: object, where: str) -> str:
-        """Return the name that a field of the message gives; `where`: place of the message, for errors."""
+        """Return a message's field at `self.path`, or its name in `self.names`. `where`: place for errors."""
         name = convert_name(field_at(message, self.path, where), f"{where}, field {self.path!r}")
         return (self.names or {}).get(name, name)
 
@@ -98,7 +98,8 @@ class Stamp:
 
         `unit`: of a numeric time. `where`: the message's place, for errors. `quoted`: whether the time may be a text.
         """
-        value, name = field_at(message, self.path, where), f"{where}, field {self.path!r}"
+        value = field_at(message, self.path, where)
+        name = f"{where}, field {self.path!r}"
         if self.start is not None and isinstance(value, str) and looks_like_date(value):
             raise fail(name, f"a number, which counts from start={self.start!r}", show_value(value))
         return convert_time(value, unit, name, quoted) + self.shift
@@ -367,12 +368,13 @@ def _split_conditions(where: object) -> tuple[Allowed, tuple[Available, ...]]:
 
 
 def _read_valid_flags(valid: object) -> Flags:
-    """Return {path of a flag: its values in a message that can be trusted}; a path alone has true or 1."""
+    """Return {path of a flag: its values in a message that can be trusted}; `valid`: such, or a path (true or 1)."""
     if valid is None or isinstance(valid, str):
         return None if valid is None else {valid: (True, 1)}
     if not isinstance(valid, Mapping):
         raise fail("json_field, valid", "a dotted path, or a dictionary of paths with their values", show_value(valid))
-    return _split_conditions(valid)[0]  # those on fields of the message
+    allowed_by_path, _available = _split_conditions(valid)
+    return allowed_by_path
 
 
 def _broadcast_to_paths(name: str, value: ArrayLike, paths: tuple[Path, ...], neutral: float) -> tuple[float, ...]:

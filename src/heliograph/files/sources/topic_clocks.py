@@ -1,4 +1,4 @@
-"""Clocks of the topics of a recording without arrivals: whether their times are of one clock."""
+"""Clocks of the topics of a recording without times of arrival: whether their times can be compared with each other."""
 
 from collections.abc import Iterable
 from contextlib import suppress
@@ -38,18 +38,26 @@ class TopicClock:
 
 
 class TopicClocks:
-    """Clocks by topic, of messages that nothing dates but their own times."""
+    """Clocks by topic, of messages without a time of arrival.
+
+    Times of different topics are put in one order. That fails if some are dates and others count from the start of a
+    device, so each clock is classified.
+    """
 
     def __init__(self) -> None:
         """Make clocks of no topics yet; a topic gets its clock with its first message."""
         self._by_topic: dict[str, TopicClock] = {}
 
     def note_time(self, topic: str, content: object, time: int, sources: Iterable[Source]) -> None:
-        """Note the time of a message, in nanoseconds since 1970, on its topic's clock.
+        """Note the time of a message on its topic's clock.
 
-        A topic's clock holds the path of its time field, whether times are numbers, its first time, and two counts: of
-        all times, and of those more than a YEAR from 1970. A time within a YEAR of 1970 is no date, but one of a clock
-        that counts from its own start.
+        A time within a YEAR of 1970 is taken for that of a clock that counts from its own start, and not for a date.
+
+        Args:
+            topic: topic of the message.
+            content: the message, decoded.
+            time: its time in nanoseconds since 1970.
+            sources: the sources of the topic, which say where the time stands.
         """
         clock = self._by_topic.get(topic)
         if clock is None:

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Collection, Mapping
+from typing import NamedTuple
 
 import numpy as np
 
@@ -30,6 +31,14 @@ LISTED = 8  # topics in one line
 COPY = 10 * SECOND  # a message that comes again so soon, with its count and values, is a copy
 
 
+class _LastReading(NamedTuple):
+    """The newest reading of a node, when it came (nanoseconds since 1970), and whether its count has ever changed."""
+
+    reading: Reading
+    moment: int
+    has_count_changed: bool
+
+
 class TopicReader:
     """Reads messages of topics by the sources of a network, as readings of nodes; unknown topics are counted.
 
@@ -52,12 +61,12 @@ class TopicReader:
         self.stored = 0  # a broker's stored messages without a time: they arrive on subscribing, so have no date
         self.excluded = Counter[str]()  # messages that a condition leaves out, by topic
         self.offline = Counter[str]()  # messages of devices that had said that they are offline, by topic
-        # By pattern of topics and path of a field: the error of the first message without it; which ones have come.
-        self.absent, self.found = dict[tuple[str, str], str](), set[tuple[str, str]]()
-        # By plant and node: the newest reading, its moment, and whether its count ever differed from the one before.
-        self._last = dict[tuple[str, str], tuple[Reading, int, bool]]()
+        # {(pattern of topics, path of a field): error of the first message without it}, and the pairs that came.
+        self.absent = dict[tuple[str, str], str]()
+        self.found = set[tuple[str, str]]()
+        self._last = dict[tuple[str, str], _LastReading]()  # by plant and node
+        # What the network expects: time in steps or not, and for each node, and the inputs, the names of its numbers.
         self.time_counts_steps = TIME_STEP not in network.inputs
-        # By node, and of the inputs: the names of its numbers.
         self.names = {name: tuple(network.nodes[name].received_names) for name in network.names}
         self.names[INPUTS] = tuple(name for name in network.inputs if name != TIME_STEP)
         if not isinstance(table, Mapping):
@@ -65,16 +74,21 @@ class TopicReader:
         self._table = {
             topic: map_sources(topic, items, self.names, self.time_counts_steps) for topic, items in table.items()
         }
-        # By topic that came, found when first asked for: its sources, and the fields that they use.
+        # By topic that came, kept when first asked for: its sources, and the fields that they use.
         self._sources_of_topic = dict[str, list[MappedSource]]()
         self._fields_of_topic = dict[str, set[str]]()
-        mapped = [single for several in self._table.values() for single in several]
-        self.device_statuses = DeviceStatuses(condition for single in mapped for condition in single.source.available)
-        # Where dates are counted in steps: the seconds of one.
-        step_lengths = {single.source.step for single in mapped}
+        sources = [mapped.source for mapped in self._mapped_sources]
+        self.device_statuses = DeviceStatuses(condition for source in sources for condition in source.available)
+        # The seconds of a step, if dates are counted in steps.
+        step_lengths = {source.step for source in sources}
         if len(step_lengths) > 1:
             raise fail("sources, step", "the same of all", sorted(map(str, step_lengths)))
         self.step_seconds = next(iter(step_lengths), None)
+
+    @property
+    def _mapped_sources(self) -> list[MappedSource]:
+        """Return the sources of all topics."""
+        return [mapped for of_topic in self._table.values() for mapped in of_topic]
 
     @property
     def topics(self) -> list[str]:
@@ -102,28 +116,31 @@ class TopicReader:
     @property
     def periods(self) -> dict[str, int]:
         """Return {node: after how many messages its running count begins again at 0}; other nodes are absent."""
-        mapped = [single for several in self._table.values() for single in several]
-        counts = [(node, single.source.sequence) for single in mapped for node in single.indices_by_node]
+        counts = [(node, mapped.source.sequence) for mapped in self._mapped_sources for node in mapped.indices_by_node]
         return {node: count.period for node, count in counts if count is not None and count.period}
 
     @property
     def nodes_without_count(self) -> set[str]:
         """Return the nodes whose messages carry no running count, so that lost messages are not known."""
-        mapped = [single for several in self._table.values() for single in several]
-        counted = {node for single in mapped for node in single.indices_by_node if single.source.sequence is not None}
-        return {node for single in mapped for node in single.indices_by_node} - counted
+        nodes, counted = set[str](), set[str]()
+        for mapped in self._mapped_sources:
+            nodes |= mapped.indices_by_node.keys()
+            if mapped.source.sequence is not None:
+                counted |= mapped.indices_by_node.keys()
+        return nodes - counted
 
     @property
     def columns(self) -> set[str]:
-        """Return the columns, of rows of a table, of which the sources say what they mean."""
-        mapped = [single.source for several in self._table.values() for single in several]
-        return {name for source in mapped for path in source.fields for name in (path, path.split(".")[0])}
+        """Return the columns of a table that the sources read: paths of their fields, and the paths' first words."""
+        paths = [path for mapped in self._mapped_sources for path in mapped.source.fields]
+        return {name for path in paths for name in (path, path.split(".")[0])}
 
     def list_fields(self, topic: str) -> set[str]:
         """Return the top-level fields of a topic's messages that sources use: the first words of their paths."""
         if topic not in self._fields_of_topic:
             fields = self._fields_of_topic.setdefault(topic, set())
-            for source, *_ in self.of(topic):
+            for mapped in self.of(topic):
+                source = mapped.source
                 names = [name.path for name in (source.plant, source.node) if isinstance(name, Field)]
                 values = [
                     field for path in source.paths for field in ((path,) if isinstance(path, str) else path.parts)
@@ -149,14 +166,16 @@ class TopicReader:
             where: place of the message, for errors.
         """
         sources, results = self.of(topic), list[Reading | Unread]()
-        self.unknown[topic] += not sources
+        if not sources:
+            self.unknown[topic] += 1
         for mapped in sources:
             try:
                 reading = self._read_by_source(mapped, topic, message, where)
             except InputError as error:
                 results.append(Unread(error, self._read_without_values(mapped, topic, message, where, error)))
             else:
-                results += [] if reading is None else [reading]
+                if reading is not None:
+                    results.append(reading)
         return results
 
     def date_copy_as_original(self, reading: Reading, arrival: int | None) -> Reading:
@@ -174,22 +193,31 @@ class TopicReader:
         if reading.sequence is None or reading.time is None or moment is None or has_no_seconds:
             return reading
         key = reading.plant, reading.node
-        before, moment_before, count_moved = self._last.get(key, (reading, -COPY - 1, False))
-        may_be_copy = reading.sequence == before.sequence and count_moved and 0 <= moment - moment_before <= COPY
-        if may_be_copy and np.array_equal(reading.values, before.values, equal_nan=True):
-            return reading._replace(time=before.time)
-        self._last[key] = reading, moment, count_moved or reading.sequence != before.sequence
+        last = self._last.get(key)
+        if last is None:
+            self._last[key] = _LastReading(reading, moment, has_count_changed=False)
+            return reading
+        is_count_repeated = reading.sequence == last.reading.sequence and last.has_count_changed
+        comes_soon_after = 0 <= moment - last.moment <= COPY
+        has_same_values = np.array_equal(reading.values, last.reading.values, equal_nan=True)
+        if is_count_repeated and comes_soon_after and has_same_values:
+            return reading._replace(time=last.reading.time)
+        has_changed = last.has_count_changed or reading.sequence != last.reading.sequence
+        self._last[key] = _LastReading(reading, moment, has_changed)
         return reading
 
     def describe_absent_field(self) -> str:
         """Return the error of the first field that no message of its topic had; "" if there is none."""
-        return next((said for key, said in self.absent.items() if key not in self.found), "")
+        return next((error for key, error in self.absent.items() if key not in self.found), "")
 
     def _read_by_source(self, mapped: MappedSource, topic: str, message: object, where: str) -> Reading | None:
         """Return a message's reading by one source; None if a condition leaves it out or another process reads it.
 
-        A source (`mapped`) says which fields of a message are which outputs of a node, by their indices
-        (`indices_by_node`).
+        Args:
+            mapped: the source, with the index of each of its values among those of a node.
+            topic: topic of the message.
+            message: the message, decoded.
+            where: place of the message, for errors.
 
         Raises:
             ValueError: a field that is not there, or is no number, time or count; one line that names it.
@@ -201,11 +229,8 @@ class TopicReader:
         if node in self.others:
             return None
         if node not in mapped.indices_by_node:
-            raise fail(
-                f"{where}, node",
-                f"one of {', '.join(mapped.indices_by_node)}",
-                suggest_name(node, mapped.indices_by_node),
-            )
+            known = mapped.indices_by_node
+            raise fail(f"{where}, node", f"one of {', '.join(known)}", suggest_name(node, known))
         source.check_valid(message, where)
         sequence, is_count_absent = self._read_message_count(source, pattern, message, where)
         # A message with a count may lack values: it measured nothing.
@@ -283,26 +308,33 @@ def _read_names(mapped: MappedSource, topic: str, message: object, where: str) -
     """Return the names of a message's plant and node; the plant is "" if there is only one."""
     source = mapped.source
     node = source.node if isinstance(source.node, str) else source.node.of(topic, message, where)
-    return "" if source.plant is None else source.plant.of(topic, message, where), node
+    plant = "" if source.plant is None else source.plant.of(topic, message, where)
+    return plant, node
 
 
 def _read_time(source: Source, message: object, where: str) -> int | None:
-    """Return the time that names a measurement, in nanoseconds since 1970 or steps; None if the source has none."""
+    """Return the time of measuring in a message, in nanoseconds since 1970 or steps; None if the source has none."""
     return None if source.time is None else source.time.of(message, source.time_unit, where, source.quoted)
 
 
 def _describe_rest(count: int) -> str:
-    """Return how many of a list are not named in a line; "" if all are."""
+    """Return " and N more" for a list of `count` names of which only the first LISTED are shown; "" if all are."""
     return "" if count <= LISTED else f" and {count - LISTED} more"
 
 
 def _read_value(message: object, path: str | Computed, where: str, quoted: bool) -> float:
-    """Return the number at a path, or one computed from several; NaN if it is missing; `quoted`: it may be a text."""
+    """Return the number at a path, or one computed from several; NaN for null or a number that is not finite.
+
+    `where`: place of the message, for errors. `quoted`: whether a text such as "1.5" counts as a number. If there is no
+    such field, MissingFieldError is raised.
+    """
     if isinstance(path, ZeroIfAbsent):  # a field that senders leave out where it is 0
         path_of_parent, _, name = path.path.rpartition(".")
         parent = field_at(message, path_of_parent, where)
-        return 0.0 if isinstance(parent, Mapping) and name not in parent else _read_value(parent, name, where, quoted)
-    if not isinstance(path, str):
+        if isinstance(parent, Mapping) and name not in parent:
+            return 0.0
+        return _read_value(parent, name, where, quoted)
+    if not isinstance(path, str):  # several fields and what is computed from them
         return float(path.of(*(_read_value(message, field, where, quoted) for field in path.parts)))
     value = field_at(message, path, where)
     if type(value) is float:  # the common case, without making the place's name for errors

@@ -31,14 +31,15 @@ BATCH = 4 * 2**20  # bytes of one request: a server may refuse more than ten mil
 
 
 def query_influx(address: StoreAddress) -> tuple[str, dict[str, Any]]:
-    """Return the measurement's name and the columns of a table, as lists; `time` is datetime64[ns].
+    """Ask a server for a table; return the measurement's name and the columns as lists, `time` as datetime64[ns].
 
-    Several series, as from GROUP BY, become one table sorted by time, with their tags as columns.
+    The statement in the address is asked in its language; without one all of the address's table is asked for, in
+    InfluxQL. Several series, as from GROUP BY, become one table sorted by time, with their tags as columns.
 
     Raises:
         ValueError: the server does not answer or refuses, or nothing came.
     """
-    query = address.query or f'SELECT * FROM "{_escape_name(address.table, chr(34))}"'
+    query = address.query or f'SELECT * FROM "{_escape_name(address.table, signs=chr(34))}"'  # chr(34) is "
     match address.language:
         case "flux":
             return parse_flux_response(address, _send_request(address, "POST", *_make_flux_request(address)))
@@ -95,14 +96,17 @@ def write_influx(address: StoreAddress, columns: Mapping[str, np.ndarray], momen
 
 
 def check_influx(address: StoreAddress) -> None:
-    """Raise ValueError where no server answers there."""
+    """Raise ValueError unless a server answers at the address."""
     _send_request(address, "GET", "/ping")
 
 
 def _batch_protocol_lines(
     table: str, columns: Mapping[str, np.ndarray], moments: np.ndarray, plant: str
 ) -> Iterator[tuple[bytes, int]]:
-    """Yield lines of the protocol in requests of a bounded size, each with its number of rows."""
+    """Yield (body, rows): bodies of requests of about BATCH bytes in line protocol, each with its number of rows.
+
+    A line is "TABLE,plant=PLANT NAME=VALUE,... NANOSECONDS". A row without any finite number has no line, but counts.
+    """
     key = _escape_name(table, ", ") + (f",plant={_escape_name(plant, ', =')}" if plant else "")
     names = [_escape_name(name, ", =") for name in columns]
     lines, size, rows = list[str](), 0, 0
@@ -120,12 +124,12 @@ def _batch_protocol_lines(
 
 
 def _format_value(value: bool | float) -> str:
-    """Return a number with all its digits, or true or false."""
+    """Return a number as line protocol writes it: a float with all its digits, or true or false."""
     return str(value).lower() if isinstance(value, bool) else repr(float(value))
 
 
 def _escape_name(name: str, signs: str) -> str:
-    """Return a name with a backslash before each of some signs."""
+    """Return a name with a backslash before each of the characters in `signs`, which would otherwise end it."""
     return re.sub(f"([{re.escape(signs)}])", r"\\\1", name)
 
 

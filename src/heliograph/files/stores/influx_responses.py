@@ -26,7 +26,7 @@ def parse_influxql_response(address: StoreAddress, answer: bytes) -> Answer:
         The name of the measurement (InfluxDB's table), and its columns.
 
     Raises:
-        ValueError: no answer of InfluxDB, a refusal, a part of the rows, none; one line.
+        ValueError: no answer of InfluxDB, a refusal, only a part of the rows, or no rows; one line.
     """
     try:
         results = json.loads(answer)["results"]  # one for each statement
@@ -95,12 +95,12 @@ def _join_flux_rows(address: StoreAddress, rows: Iterable[dict[str, Any]]) -> tu
 
     Args:
         address: address of the store, for errors.
-        rows: rows as {column: value}; they are changed.
+        rows: rows as {column: value}; columns are taken out of them.
 
     Raises:
-        ValueError: an error in the place of a row; a tag of a field's name; two values of a field at one time.
+        ValueError: an error in the place of a row; a tag with the name of a field; two values of a field at one time.
     """
-    joined: dict[tuple[object, ...], dict[str, Any]] = {}
+    joined: dict[tuple[object, ...], dict[str, Any]] = {}  # rows of the result, by what their fields have in common
     first_measurement = ""
     for number, row in enumerate(rows):
         # A row may report an error of the query.
@@ -116,9 +116,11 @@ def _join_flux_rows(address: StoreAddress, rows: Iterable[dict[str, Any]]) -> tu
         if "_field" not in row or "_value" not in row:  # pivoted, or columns of a query's own: a row by itself
             joined[(number,)] = row
             continue
-        # The remaining columns are the time and the tags, which all fields of one row share: they are the key.
+        # What remains in `row` are the time and the tags, which all fields of one row of the result share.
         name, value = str(row.pop("_field")), row.pop("_value")
-        fields = joined.setdefault((measurement, *sorted(row.items())), row.copy())
+        key = (measurement, *sorted(row.items()))
+        fields = joined.setdefault(key, row.copy())
+        # The field has another value at this time already. (A tag of the same name is refused below.)
         if name in fields and name not in row and fields[name] != value:
             remedy = "a query that yields several results, such as a mean and a maximum, sets _field of each"
             raise fail(
@@ -129,10 +131,10 @@ def _join_flux_rows(address: StoreAddress, rows: Iterable[dict[str, Any]]) -> tu
 
 
 def _join_row_with_tags(address: StoreAddress, tags: Row, columns: Row) -> dict[str, Any]:
-    """Return the columns of a row with its tags, the words of InfluxDB that name its series.
+    """Return {**tags, **columns}: a row's columns with its tags (names and texts that InfluxDB gives a whole series).
 
     Raises:
-        ValueError: a tag and a column have the same name and different values, of which one would be lost.
+        ValueError: a tag and a column have the same name and different values, so that one would be lost.
     """
     shared_name = next((name for name in tags if name in columns and tags[name] != columns[name]), None)
     if shared_name is not None:
@@ -177,7 +179,7 @@ READ: dict[str, Callable[[str], Any]] = {
 
 
 def _read_moment(time: object) -> int:
-    """Return the nanoseconds of a date of UTC, as 2026-11-29T10:00:00.123456789Z."""
+    """Return a date in UTC, such as 2026-11-29T10:00:00.123456789Z, in nanoseconds since 1970."""
     return int(np.datetime64(str(time).removesuffix("Z"), "ns").astype(np.int64))
 
 
@@ -208,7 +210,7 @@ def _make_columns(
     return columns
 
 
-def shorten_answer(said: str) -> str:
-    """Return what a server says as one line of at most 200 characters."""
-    line = " ".join(said.split())
+def shorten_answer(answer: str) -> str:
+    """Return what a server says as one line of at most SAID (200) characters, and "..." if there were more."""
+    line = " ".join(answer.split())
     return line if len(line) <= SAID else f"{line[:SAID]}..."

@@ -12,12 +12,12 @@ from heliograph.numerics.check import InputError, fail
 
 LONGEST = 63  # bytes of a column's name; what is longer would be cut
 PLANT, TIME = "plant", "time"
-# By NumPy's kinds. Whole numbers are those that doubles cannot tell apart, such as nanoseconds.
+# {kind of a NumPy type: type of the column}. Integers are too large for doubles, such as nanoseconds.
 TYPES = {"b": "boolean", "f": "double precision", "M": "timestamptz", "i": "bigint", "u": "numeric"}
 
 
 def query_postgres(address: StoreAddress) -> tuple[str, dict[str, Any]]:
-    """Return the database's name and the columns of a table, as lists, asked for in a transaction that only reads.
+    """Return the database's name and the columns of a table as lists, read in a transaction that can only read.
 
     `address` names the server, the database, and either a statement (`query`) or a table, which is read in the order of
     its column `time`. Times come in UTC.
@@ -25,7 +25,7 @@ def query_postgres(address: StoreAddress) -> tuple[str, dict[str, Any]]:
     Raises:
         ValueError: the server is away or refuses; no rows; a name twice. One line.
     """
-    # The URL's statement, or else all of its table.
+    # The address's statement, or else all of its table.
     table = sql.SQL("SELECT * FROM {} ORDER BY time").format(sql.Identifier(*address.table.split(".")))
     query: Any = address.query.encode() or table
     try:
@@ -48,7 +48,7 @@ def query_postgres(address: StoreAddress) -> tuple[str, dict[str, Any]]:
 
 
 def write_postgres(address: StoreAddress, columns: Mapping[str, np.ndarray], plant: str) -> None:
-    """Write rows to a table, which is made where there is none, in place of its rows of these times and this plant.
+    """Write rows to a table; it is made if it is missing, and its rows of the same times and plant are replaced.
 
     The table has the columns `plant` (text) and `time` (timestamptz, or numbers), and the other `columns`. Rows of this
     plant from the first to the last of the times are deleted first, so that a repeated call changes nothing. All or
@@ -67,7 +67,10 @@ def write_postgres(address: StoreAddress, columns: Mapping[str, np.ndarray], pla
         raise fail(str(address), f"columns whose names have at most {LONGEST} bytes", repr(too_long))
     # The parts of the statements: the table, each column with its type, all their names.
     table = sql.Identifier(*address.table_for_estimates.split("."))
-    typed = [sql.SQL("{} {}").format(sql.Identifier(n), sql.SQL(TYPES[c.dtype.kind])) for n, c in columns.items()]
+    typed = [
+        sql.SQL("{} {}").format(sql.Identifier(name), sql.SQL(TYPES[column.dtype.kind]))
+        for name, column in columns.items()
+    ]
     names = sql.SQL(", ").join(map(sql.Identifier, (PLANT, *columns)))
     cells = [_convert_cells(column) for column in columns.values()]
     times = _convert_cells(np.sort(columns[TIME]))
@@ -106,6 +109,7 @@ def _explain_error(address: StoreAddress, error: Exception) -> InputError:
 
     It says whether the server did not answer, or refused what it got.
     """
-    said = next((line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__)
-    away = isinstance(error, psycopg.OperationalError)
-    return fail(str(address), "a server that answers" if away else "what the server accepts", said)
+    first_line = next((line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__)
+    has_no_answer = isinstance(error, psycopg.OperationalError)
+    expected = "a server that answers" if has_no_answer else "what the server accepts"
+    return fail(str(address), expected, first_line)

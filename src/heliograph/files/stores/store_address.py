@@ -4,7 +4,7 @@ import os
 import re
 from dataclasses import dataclass, field, replace
 from typing import Literal, cast
-from urllib.parse import unquote, urlsplit, urlunsplit
+from urllib.parse import SplitResult, unquote, urlsplit, urlunsplit
 
 SHAPE = "influx://HOST:PORT/DATABASE or postgresql://HOST/DATABASE, with ?table=NAME or ?query=SELECT..."
 INFLUX, POSTGRES = ("influx", "influxs"), ("postgresql",)
@@ -16,7 +16,7 @@ ASKS = re.compile(r"(?<=[?&])(query|flux|sql)=")  # begins a statement, which go
 
 @dataclass(frozen=True)
 class StoreAddress:
-    """Where a table is kept, or what asks for one; printed it is the URL without user, password and query.
+    """Where a table is kept, or the statement that asks for one; `str` of it is the URL without secrets and query.
 
     Attributes:
         kind: scheme of the URL: "influx", "influxs" (TLS) or "postgresql".
@@ -48,7 +48,7 @@ class StoreAddress:
         return self.table or ESTIMATES
 
     def with_table(self, table: str) -> "StoreAddress":
-        """Return the address of another table there."""
+        """Return the address of another table of the same database."""
         return replace(self, table=table)
 
     @property
@@ -68,7 +68,7 @@ def is_store(location: object) -> bool:
     return isinstance(location, str) and location.split("://")[0] in (*INFLUX, *POSTGRES) and "://" in location
 
 
-ASKED = "one of table=NAME and query=SELECT..."
+ASKED = "one of table=NAME and query=SELECT..."  # what is expected, in errors
 ESCAPED = "a user and a password in which / ? # and @ are written %2F %3F %23 and %40"
 
 
@@ -84,22 +84,14 @@ def parse_store(url: str) -> StoreAddress:
     from heliograph.numerics.check import fail, text  # not before a command needs it
 
     text("store", url)
-    # "scheme://.../database?options", then "query", "flux" or "sql" and the statement, where there is one.
+    # "scheme://.../database?options&", then "query", "flux" or "sql" and the statement; these are "" if there is none.
     location, language, statement = [*ASKS.split(url, maxsplit=1), "", ""][:3]
-    try:
-        parts = urlsplit(location)
-        host, _ = parts.hostname, parts.port  # `port` is read because it raises at one that is no number
-    except ValueError:
-        raise fail("store", ESCAPED if "@" in location else SHAPE, "an address that cannot be read") from None
-    if "@" in parts.path:  # the first / ends the host, so that what stands before it is none
-        raise fail("store", ESCAPED, "an address with an @ behind its first /")
+    parts = _split_location(location)
     database = unquote(parts.path).strip("/")
     is_influx = parts.scheme in INFLUX
-    if parts.scheme not in (*INFLUX, *POSTGRES) or not database or (is_influx and not host):
-        raise fail("store", SHAPE, f"{parts.scheme}://{host or ''}{parts.path}")
-    store = f"store {parts.scheme}://{host or ''}/{database}"
+    store = f"store {parts.scheme}://{parts.hostname or ''}/{database}"  # for errors
     # The options before the statement. A URL has one table or one statement, in a language that the server has.
-    table, organisation = _read_options(store, parts.query, is_influx, asks=bool(language))
+    table, organisation = _read_options(store, parts.query, is_influx, has_statement=bool(language))
     if language and not statement.strip():
         raise fail(store, ASKED, "both, or one without a value")
     if not is_influx and language not in ("", "query"):
@@ -117,21 +109,44 @@ def parse_store(url: str) -> StoreAddress:
     )
 
 
-def _read_options(store: str, options: str, is_influx: bool, asks: bool) -> tuple[str, str]:
-    """Return the table and the organisation that options of a URL name, "" where they name none.
-
-    Args:
-        store: the store, for errors.
-        options: the options, "table=NAME&org=NAME"; of PostgreSQL others are the server's.
-        is_influx: whether the store is InfluxDB, which has no other options than these two.
-        asks: whether the URL has a statement (a query); then no table may be named.
+def _split_location(location: str) -> SplitResult:
+    """Return the parts of a store's URL without its statement: scheme, host, path (the database) and options (`query`).
 
     Raises:
-        ValueError: an option that InfluxDB has not, several tables, a table beside a statement.
+        ValueError: another scheme, no database, no host of InfluxDB, an @ or / of a password that is not escaped.
     """
     from heliograph.numerics.check import fail
 
-    # The table's option, and all others, one of which may be InfluxDB's organisation.
+    try:
+        parts = urlsplit(location)
+        host, _port = parts.hostname, parts.port  # reading `port` raises ValueError if it is no number
+    except ValueError:
+        raise fail("store", ESCAPED if "@" in location else SHAPE, "an address that cannot be read") from None
+    if "@" in parts.path:  # the first / ends the host: the / belongs to a user or a password
+        raise fail("store", ESCAPED, "an address with an @ behind its first /")
+    has_database = bool(unquote(parts.path).strip("/"))
+    lacks_host = parts.scheme in INFLUX and not host
+    if parts.scheme not in (*INFLUX, *POSTGRES) or not has_database or lacks_host:
+        raise fail("store", SHAPE, f"{parts.scheme}://{host or ''}{parts.path}")
+    return parts
+
+
+def _read_options(store: str, options: str, is_influx: bool, has_statement: bool) -> tuple[str, str]:
+    """Return (table, organisation) that the options of a URL name; "" for one that they do not name.
+
+    Args:
+        store: the store, for errors.
+        options: the options, such as "table=NAME&org=NAME". Other options of PostgreSQL are ignored here: the server
+            gets them.
+        is_influx: whether the store is InfluxDB, which has no other options than these two.
+        has_statement: whether the URL has a statement (a query); then no table may be named.
+
+    Raises:
+        ValueError: another option of InfluxDB, several tables, or a table beside a statement.
+    """
+    from heliograph.numerics.check import fail
+
+    # Split the options into the table's and the others, of which InfluxDB's organisation is taken out.
     decoded = [unquote(option) for option in options.split("&") if option]
     tables = [option.removeprefix("table=") for option in decoded if option.startswith("table=")]
     others = [option for option in decoded if not option.startswith("table=")]
@@ -140,7 +155,7 @@ def _read_options(store: str, options: str, is_influx: bool, asks: bool) -> tupl
         organisation = others.pop().removeprefix("org=")
     if is_influx and others:
         raise fail(store, ASKED, others[0].split("=")[0])
-    if asks and tables:
+    if has_statement and tables:
         raise fail(store, ASKED, "both, or one without a value")
     if len(tables) > 1:
         raise fail(store, ASKED, "several")

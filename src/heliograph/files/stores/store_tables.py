@@ -22,7 +22,7 @@ DIGITS = 15  # of a decimal number, which a double gives back
 
 @dataclass(frozen=True)
 class StoreTable:
-    """What came for a query; printed it is the address.
+    """The rows that a store returned for a query; `str` of it is the address.
 
     Attributes:
         address: where it came from.
@@ -35,12 +35,13 @@ class StoreTable:
     columns: Mapping[str, Any]
 
     def __str__(self) -> str:
+        """Return the address without secrets, by which errors name the table."""
         return str(self.address)
 
     def rows(self, only: Mapping[str, str] | None) -> TableRows:
-        """Return the table's rows of numbers and dates, numbered from 1.
+        """Return the table as columns of numbers and dates, with rows numbered from 1.
 
-        `only` holds the columns that are read; None for all.
+        `only`: the columns that are read, as keys; None for all.
 
         Raises:
             ValueError: a column holds text.
@@ -58,10 +59,10 @@ class StoreTable:
 
 
 def _convert_cell(cell: object) -> object:
-    """Return a cell as JSON would have it."""
+    """Return a cell as a message in JSON would have it: dates as text, short decimal numbers as floats."""
     if isinstance(cell, np.datetime64):
         return f"{cell}Z"
-    if isinstance(cell, date):  # and moments
+    if isinstance(cell, date):  # `datetime` is a `date`, too
         return cell.isoformat()
     if isinstance(cell, Decimal) and len(cell.as_tuple().digits) <= DIGITS:
         return float(cell)
@@ -105,10 +106,16 @@ def check_store(address: StoreAddress) -> None:
 def write_columns_to_store(
     address: StoreAddress, columns: Mapping[str, np.ndarray], plant: str, origin: np.datetime64 | None
 ) -> None:
-    """Write the columns of estimates; times that are seconds since `origin` become dates.
+    """Write the columns of estimates to a table of InfluxDB or PostgreSQL.
+
+    Args:
+        address: the store, and the table.
+        columns: the columns by name, (rows,) each; one of them is `time`.
+        plant: name of the plant, "" of a single one.
+        origin: date from which times count in seconds, to make dates of them; None to write times as they are.
 
     Raises:
-        ValueError: times that are numbers, of InfluxDB; the server is away or refuses; one line.
+        ValueError: InfluxDB would get times that are numbers; the server does not answer or refuses; one line.
     """
     dated = dict(columns)
     if origin is not None and dated[TIME].dtype.kind != "M":

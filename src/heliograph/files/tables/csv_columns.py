@@ -34,17 +34,26 @@ def read_csv_blocks(
     Raises:
         ValueError: the header names no columns, or reading is strict and a row cannot be read.
     """
-    text, columns = CsvReader(str(path), path, marked=False), CsvColumnReader(str(path), path, only, strict)
-    blocks = read_line_blocks(path, size, progress)
-    for lines in blocks if strict else yield_until_cut_off(blocks):
-        yield columns.read([lines]) if isinstance(lines, CutOffError) else _read_csv_lines(text, columns, lines)
+    text = CsvReader(str(path), path, marked=False)  # splits lines into cells
+    columns = CsvColumnReader(str(path), path, only, strict)  # makes columns of the cells
+    blocks: Iterator[bytes | CutOffError] = read_line_blocks(path, size, progress)
+    if not strict:  # a file that was cut off is read up to there, and the error comes last
+        blocks = yield_until_cut_off(blocks)
+    for lines in blocks:
+        if isinstance(lines, CutOffError):
+            yield columns.read([lines])
+        else:
+            yield _read_csv_lines(text, columns, lines)
     yield columns.read(text.end())
 
 
 def _read_csv_lines(text: CsvReader, columns: "CsvColumnReader", lines: bytes) -> TableRows:
-    """Return the rows of some lines: all at once where they are plain numbers, else cell by cell, with what fails.
+    """Return the rows in a block of whole lines: fast, all at once, if they are plain numbers, else cell by cell.
 
-    `text` splits lines into cells and knows the header; it is open where a quoted cell goes on in the next line.
+    Args:
+        text: splits lines into cells and knows the header; it is open while a quoted cell goes on in the next line.
+        columns: makes columns of the cells, and refuses rows that cannot be read.
+        lines: bytes of the lines.
     """
     # Line by line until the header, with the names of the columns, has come.
     rows, begin = list[CsvRow | InputError](), 0
@@ -56,8 +65,9 @@ def _read_csv_lines(text: CsvReader, columns: "CsvColumnReader", lines: bytes) -
     if not rows and text.header and not text.is_open:
         numbers = parse_numeric_lines(rest, len(text.header))
         if numbers is not None and columns.accepts_numbers(text.header, numbers):
+            first = text.number + 1
             text.number += len(numbers)
-            return columns.make_rows_of_numbers(text.header, numbers, text.number - len(numbers) + 1)
+            return columns.make_rows_of_numbers(text.header, numbers, first)
     return columns.read([*rows, *(row for line in split_lines(rest) for row in text.add(line))])
 
 
@@ -76,23 +86,28 @@ class CsvColumnReader:
 
         `only`: the columns to read, None for all. `strict`: whether a row that cannot be read is an error.
         """
-        self.source, self.path, self._only, self._strict = source, path, only, strict
+        self.source = source
+        self.path = path
+        self._only = only
+        self._strict = strict
         self.header: list[str] = []
         self._dated = dict[str, bool]()  # for each column whether it holds dates, as soon as a cell tells it
         self._zoned = dict[str, bool]()  # for each column of dates whether these have a time zone
 
     def read(self, rows: Iterable[CsvRow | InputError]) -> TableRows:
-        """Return the rows that can be read as columns by name with their numbers in the file, and errors of the others.
+        """Return the rows that can be read, as columns, and the errors of the others.
 
         Args:
-            rows: for each row of the file its number and its cells, or the error for which it could not be split.
+            rows: for each row of the file its number and its cells, or the error why it could not be split into cells.
 
         Raises:
             ValueError: another header than before; where reading is strict, a row that cannot be read.
         """
         refused = list[InputError]()
         # Of each row that can be read: its number in the file, its cells, and these as numbers.
-        numbers, texts, values = list[int](), list[list[str]](), list[list[float | int]]()
+        numbers = list[int]()
+        texts = list[list[str]]()
+        values = list[list[float | int]]()
         for row in rows:
             try:
                 if isinstance(row, InputError):
@@ -115,9 +130,9 @@ class CsvColumnReader:
         return TableRows(columns, np.array(numbers, dtype=np.int64), refused)
 
     def accepts_numbers(self, header: list[str], numbers: Float[np.ndarray, "rows columns"]) -> bool:
-        """Return whether numbers that were parsed as doubles can stand for the cells.
+        """Return whether doubles, parsed from the text without looking at the cells, lose nothing of the cells.
 
-        They cannot if the header is another one, if a number reaches EXACT (2^53, from where doubles skip integers), or
+        They do not if the header is another one, if a number reaches EXACT (2^53, from where doubles skip integers), or
         if there is a number in a column of dates.
         """
         if self.header not in ([], header) or np.nanmax(np.abs(numbers), initial=0.0) >= EXACT:
@@ -128,11 +143,12 @@ class CsvColumnReader:
     def make_rows_of_numbers(
         self, header: list[str], numbers: Float[np.ndarray, "rows columns"], first: int
     ) -> TableRows:
-        """Return numbers under this header as rows, numbered from `first`.
+        """Return rows, numbered from `first`, from their numbers (rows, columns) under a header; NaN is an empty cell.
 
-        `self._dated` says by column whether it is of dates, once a cell has said it; an all-empty column says nothing.
+        `self._dated` says by column whether it is of dates. A number decides that it is not; an empty column nothing.
         """
-        self.header, columns = header, dict[str, np.ndarray]()
+        self.header = header
+        columns = dict[str, np.ndarray]()
         for name, values in zip(header, numbers.T, strict=True):
             if self._only is not None and name not in self._only:
                 continue
@@ -145,7 +161,10 @@ class CsvColumnReader:
         return TableRows(columns, np.arange(first, first + len(numbers)), [])
 
     def _add_column(self, columns: dict[str, np.ndarray], name: str, values: np.ndarray) -> None:
-        """Add a column by name; of several without one, as commas at the ends of lines make, that with values.
+        """Add a column `values` under its name to `columns`.
+
+        Only columns without a name ("") may come twice, as commas at the ends of lines make them: of these the one that
+        has values is kept.
 
         Raises:
             ValueError: there are values in several columns without a name.
@@ -190,9 +209,10 @@ class CsvColumnReader:
         return numbers
 
     def _parse_number(self, row: CsvRow, name: str, cell: str) -> float:
-        """Return the number in a cell, NaN if there is none; unless reading is strict, an infinite one is an error.
+        """Return the number in a cell, NaN if it is empty.
 
-        Else the doubles that have it would cost the whole numbers of the column their last digits.
+        Unless reading is strict, infinity is an error: it would make the column one of doubles, in which large integers
+        lose their last digits.
         """
         number = parse_cell(row.where, name, cell, self.path)
         if not self._strict and np.isinf(number):
@@ -207,7 +227,7 @@ class CsvColumnReader:
 
     @staticmethod
     def _is_missing(cell: str) -> bool:
-        """Return whether a cell is empty, or says that there is no value."""
+        """Return whether a cell is empty, or is a word for no value, such as "nan", "null" or "n/a" (NO_VALUE)."""
         return not cell or NO_VALUE.fullmatch(cell) is not None
 
     def _parse_date(self, row: CsvRow, name: str, cell: str) -> int:
@@ -224,8 +244,13 @@ class CsvColumnReader:
     def _make_column(self, name: str, values: list[float | int], cells: list[str]) -> np.ndarray:
         """Return a column as dates, as int64 or as floats.
 
-        The `values` of dates are nanoseconds since 1970. int64 is used if all cells are integers and one reaches EXACT
-        (2^53), from where doubles skip integers. NAT stands for an empty cell among dates and among int64.
+        int64 is used if all cells are integers and one reaches EXACT (2^53), from where doubles skip integers. NAT
+        stands for an empty cell among dates and among int64.
+
+        Args:
+            name: name of the column; `self._dated` says whether it holds dates.
+            values: the number in each cell, NaN if it is empty; of dates nanoseconds since 1970.
+            cells: the cells' texts, from which integers are read with all digits.
         """
         if self._dated.get(name):
             # Empty cells before the first date are NaN, which is the only number that differs from itself.
@@ -234,12 +259,12 @@ class CsvColumnReader:
         numbers = np.array(values, dtype=np.float64)
         if not np.any(np.abs(numbers) >= EXACT):
             return numbers
-        found = [WHOLE.fullmatch(cell) for cell in cells]
-        if not all(match or np.isnan(number) for match, number in zip(found, numbers, strict=True)):
+        matches = [WHOLE.fullmatch(cell) for cell in cells]
+        if not all(match or np.isnan(number) for match, number in zip(matches, numbers, strict=True)):
             return numbers
-        return np.array([int(match[1]) if match else NAT for match in found], dtype=np.int64)
+        return np.array([int(match[1]) if match else NAT for match in matches], dtype=np.int64)
 
 
 def _is_empty(values: np.ndarray) -> bool:
-    """Return whether a column has no value: NaN, NaT, or the number of NaT among int64."""
+    """Return whether a column has no value at all: only NaN, NaT, or among int64 the integer of NaT."""
     return bool((np.isnat(values) if values.dtype.kind == "M" else find_missing(values)).all())

@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 def read_parquet_blocks(
     path: Path, only: Container[str] | None, rows: int, progress: Progress | None = None
 ) -> Iterator[TableRows]:
-    """Yield the rows of a Parquet file, so many at a time: numbers, NaN where null, and dates in nanoseconds.
+    """Yield the rows of a Parquet file, a block at a time, so that a long file need not fit in memory.
 
-    A long file need not fit in memory.
+    Numbers are NaN where the file has null; dates are in nanoseconds.
 
     Args:
         path: the file.
@@ -68,10 +68,15 @@ def _convert_table(table: "pa.Table", path: Path, only: Container[str] | None, f
 
 
 def _convert_column(column: "pa.ChunkedArray[Any]", where: str, name: str, first: int) -> np.ndarray:
-    """Return a column of Arrow as dates, integers (which may be too large for float64), or other numbers.
+    """Return a column of Arrow as dates, as integers (which may be too large for float64), or as other numbers.
 
-    Decimal numbers are the nearest doubles, whole ones are integers. `where` is the place of its first row and `name`
-    its own, for errors; `first` is the number of its first row.
+    Decimal numbers without fraction are integers, others become the nearest doubles.
+
+    Args:
+        column: the column, or a part of it.
+        where: place of its first row, for errors.
+        name: place of the column, for errors.
+        first: number of its first row.
 
     Raises:
         ValueError: it holds neither numbers nor dates.
@@ -93,9 +98,10 @@ def _convert_column(column: "pa.ChunkedArray[Any]", where: str, name: str, first
         return convert_integers_of_arrow(column)
     if pa.types.is_decimal(kind):
         values = column.to_pylist()
-        whole = kind.scale <= 0 and all(value is None or abs(value) < 2**63 for value in values)
-        if whole:
-            return convert_integers_of_arrow(pa.chunked_array([pa.array([v and int(v) for v in values], pa.int64())]))
+        are_integers = kind.scale <= 0 and all(value is None or abs(value) < 2**63 for value in values)
+        if are_integers:
+            integers = [None if value is None else int(value) for value in values]
+            return convert_integers_of_arrow(pa.chunked_array([pa.array(integers, pa.int64())]))
         return np.array([np.nan if value is None else float(value) for value in values], dtype=np.float64)
     # All other numbers; a column without values (null) is NaN.
     if not (pa.types.is_null(kind) or (pa.types.is_primitive(kind) and not pa.types.is_temporal(kind))):

@@ -82,7 +82,7 @@ def _check_indexes(name: str, columns: Mapping[str, Any]) -> None:
 
 
 def _has_index(values: object) -> bool:
-    """Return whether a column is one of pandas, with an index; a list has a function of that name."""
+    """Return whether a column has an index as those of pandas do; the `index` of a list is a function."""
     return hasattr(getattr(values, "index", None), "equals")
 
 
@@ -92,30 +92,11 @@ def _convert_column(values: Any, name: str) -> np.ndarray:
     Tables may be pandas, Arrow, NumPy or plain lists; each kind marks missing values in its own way. Whole numbers keep
     all digits, also those that doubles do not have. `name`: of the column, for errors.
     """
-    # Numbers of pandas, with a mask of missing values; whole numbers of Arrow; masked whole numbers of NumPy.
-    if hasattr(values, "isna") and values.dtype.kind in "iufb":  # pandas's own kinds of number have a mask
-        kind = {"i": np.int64, "u": np.uint64, "b": np.bool_}.get(values.dtype.kind, np.float64)
-        absent = np.asarray(values.isna(), dtype=bool)
-        return convert_to_numbers(values.to_numpy(dtype=kind, na_value=kind(0)), absent)
-    if hasattr(values, "null_count") and hasattr(values, "chunks") and str(values.type).startswith(("int", "uint")):
-        return convert_integers_of_arrow(values)
-    if isinstance(values, np.ma.MaskedArray) and values.dtype.kind in "iu":
-        return convert_to_numbers(np.asarray(values), np.ma.getmaskarray(values))
-    # All others as a NumPy array. Large whole numbers in a list that also has other numbers keep their digits.
-    if hasattr(values, "to_numpy"):
-        column = values.to_numpy()
-    else:
-        is_of_objects = type(values) is np.ndarray and values.dtype.kind == "O"
-        column = values if is_of_objects else np.asarray(fill_masked(values))
-        if (
-            isinstance(values, list | tuple)
-            and column.dtype.kind == "f"
-            and np.nanmax(np.abs(column), initial=0) >= EXACT
-        ):
-            column = np.array(
-                values, dtype=object
-            )  # among these whole numbers keep the digits that doubles do not have
+    numbers = _convert_masked_numbers(values)
+    if numbers is not None:
+        return numbers
     # Convert by the type of the array: dates, numbers, or objects one by one.
+    column = _make_array(values)
     if column.ndim != 1:
         raise fail(name, "one number or date in each row", f"shape {column.shape}")
     if column.dtype.kind == "M":
@@ -125,6 +106,36 @@ def _convert_column(values: Any, name: str) -> np.ndarray:
     if column.dtype.kind in "OUT":
         return _convert_object_column(column, name)
     raise fail(name, "numbers or dates", f"{column.dtype}")
+
+
+def _convert_masked_numbers(values: Any) -> np.ndarray | None:
+    """Return the numbers of a column that has a mask of missing values beside them; None for any other column.
+
+    Such are numbers of pandas, integers of Arrow and masked integers of NumPy. Missing numbers become NaN (MISSING in a
+    column of int64).
+    """
+    if hasattr(values, "isna") and values.dtype.kind in "iufb":  # pandas
+        kind = {"i": np.int64, "u": np.uint64, "b": np.bool_}.get(values.dtype.kind, np.float64)
+        absent = np.asarray(values.isna(), dtype=bool)
+        return convert_to_numbers(values.to_numpy(dtype=kind, na_value=kind(0)), absent)
+    if hasattr(values, "null_count") and hasattr(values, "chunks") and str(values.type).startswith(("int", "uint")):
+        return convert_integers_of_arrow(values)
+    if isinstance(values, np.ma.MaskedArray) and values.dtype.kind in "iu":
+        return convert_to_numbers(np.asarray(values), np.ma.getmaskarray(values))
+    return None
+
+
+def _make_array(values: Any) -> np.ndarray:
+    """Return a column as a NumPy array; of objects if it is a list with integers that doubles cannot hold."""
+    if hasattr(values, "to_numpy"):
+        return np.asarray(values.to_numpy())
+    if type(values) is np.ndarray and values.dtype.kind == "O":
+        return values
+    column = np.asarray(fill_masked(values))
+    is_list_of_floats = isinstance(values, list | tuple) and column.dtype.kind == "f"
+    if is_list_of_floats and np.nanmax(np.abs(column), initial=0) >= EXACT:
+        return np.array(values, dtype=object)
+    return column
 
 
 def _convert_object_column(column: np.ndarray, name: str) -> np.ndarray:
@@ -140,7 +151,7 @@ def _convert_object_column(column: np.ndarray, name: str) -> np.ndarray:
         return parse_dates(column, name)
     texts = [x for x in column if isinstance(x, str | bytes)]
     try:
-        if texts:  # `float` would read some
+        if texts:  # a text is an error, although `float` would accept some
             raise TypeError
         absent = np.array([value is None for value in column], dtype=bool)
         numbers = [0.0 if value is None else value for value in column]
@@ -213,11 +224,12 @@ def read_row_blocks(
     Raises:
         ValueError: what `read_table` refuses, but for a table without rows.
     """
-    # A format of our own, or one that a package of somebody else's reads; `format_of` raises at any other.
-    kind, is_ours = find_extension(path), find_extension(path) in FORMATS
-    plugin = None if is_ours else find_plugin(FORMATS_OF_OTHERS, path.suffix.lower().removeprefix("."))
-    if plugin is None and not is_ours:
-        kind = format_of(path)
+    # CSV and Parquet (`kind`), or a format that another installed package reads; `format_of` raises for any other.
+    kind, plugin = find_extension(path), None
+    if kind not in FORMATS:
+        plugin = find_plugin(FORMATS_OF_OTHERS, path.suffix.lower().removeprefix("."))
+        if plugin is None:
+            kind = format_of(path)
     if not path.is_file():
         raise fail(str(path), "a file", "a folder" if path.is_dir() else "nothing of that name")
     if path.stat().st_size == 0:

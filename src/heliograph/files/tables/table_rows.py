@@ -12,14 +12,14 @@ EXACT = 2**53  # up to here doubles hold every whole number
 
 
 class TableRows(NamedTuple):
-    """Rows of a table that could be read, as columns; their numbers, from 1; and why others could not be read.
+    """Rows of a table as columns, and why other rows could not be read.
 
-    Where a cell is empty stands NaN, NaT among dates, and MISSING, the number of NaT, in a column of int64.
+    An empty cell is NaN, NaT among dates, and MISSING (the integer that stands for NaT) in a column of int64.
     """
 
-    columns: dict[str, np.ndarray]
-    numbers: np.ndarray
-    refused: list[InputError]
+    columns: dict[str, np.ndarray]  # by name, (rows,) each
+    numbers: np.ndarray  # of the rows in the table, from 1, (rows,)
+    refused: list[InputError]  # an error for each row that could not be read
 
 
 def join_rows(parts: Iterable[TableRows]) -> TableRows:
@@ -57,20 +57,20 @@ def _are_whole_numbers(numbers: np.ndarray) -> bool:
 
 
 def _convert_to_whole(numbers: np.ndarray) -> np.ndarray:
-    """Return whole numbers as int64, MISSING where one is NaN."""
+    """Return whole numbers, float64 or int64, as int64; NaN becomes MISSING."""
     if numbers.dtype.kind == "i":
         return numbers
     return np.where(np.isnan(numbers), MISSING, np.nan_to_num(numbers).astype(np.int64))
 
 
 def convert_to_doubles(numbers: np.ndarray) -> np.ndarray:
-    """Return numbers as float64, NaN where one of int64 is MISSING."""
+    """Return numbers as float64; in a column of int64 MISSING becomes NaN."""
     doubles = np.asarray(numbers, dtype=np.float64)
     return np.where(numbers == MISSING, np.nan, doubles) if numbers.dtype.kind == "i" else doubles
 
 
 def find_missing(numbers: np.ndarray) -> np.ndarray:
-    """Return where numbers of float64 or int64 are missing."""
+    """Return the mask of the missing numbers: NaN of float64, MISSING of int64."""
     return np.asarray(numbers == MISSING if numbers.dtype.kind == "i" else np.isnan(numbers))
 
 
@@ -99,7 +99,7 @@ def convert_to_nanoseconds(column: np.ndarray, name: str, first: int = 1) -> np.
         ValueError: a date is beyond 64 bits of nanoseconds, or has a fraction of a nanosecond. The error names its row.
     """
     moments = round_to_nanoseconds(column)
-    # Convert back: a date out of reach becomes NaT, and one that lost a fraction becomes another date.
+    # Convert back and compare: a date out of reach is NaT then, and one that lost a fraction is another date.
     wrong = ~np.isnat(column) & (moments.astype(column.dtype) != column)
     if wrong.any():
         row = int(np.argmax(wrong))

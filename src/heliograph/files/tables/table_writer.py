@@ -17,8 +17,8 @@ from heliograph.numerics.times.dates import format_dates
 if TYPE_CHECKING:
     import pyarrow as pa
 
-WITH_EXPONENT = 1e-5, 1e-4  # sizes of numbers that Python writes with an exponent, and JSON without
-LARGE = 1e16  # size from which on Python writes a sign before the exponent
+WITH_EXPONENT = 1e-5, 1e-4  # range of absolute values that Python writes with an exponent, and JSON without
+LARGE = 1e16  # absolute value from which on Python writes a sign before the exponent
 BLOCK = 4096  # rows whose cells are in memory as texts at a time
 
 Append = Callable[[Mapping[str, np.ndarray]], None]  # called with columns by name, all of one length
@@ -26,7 +26,7 @@ Append = Callable[[Mapping[str, np.ndarray]], None]  # called with columns by na
 
 @contextmanager
 def open_table(path: Path) -> Iterator[Append]:
-    """Open a CSV or Parquet file; yields a function that appends rows, in the same columns each time.
+    """Open a CSV or Parquet file; yield a function that appends rows, which must have the same columns each time.
 
     The file appears once the context ends, and not at all after an error or interrupt.
 
@@ -42,7 +42,7 @@ def open_table(path: Path) -> Iterator[Append]:
 
 @contextmanager
 def _open_csv(path: Path) -> Iterator[Append]:
-    """Open a new file of CSV; yields a function that appends rows."""
+    """Open a new CSV file; yield a function that appends rows."""
     with path.open("x", newline="", encoding="utf-8") as file:
 
         def append(columns: Mapping[str, np.ndarray]) -> None:
@@ -57,7 +57,7 @@ def _open_csv(path: Path) -> Iterator[Append]:
 
 @contextmanager
 def _open_parquet(path: Path) -> Iterator[Append]:
-    """Open a Parquet file; dates are nanoseconds of UTC."""
+    """Open a new Parquet file; yield a function that appends rows. Dates are stored as nanoseconds of UTC."""
     import pyarrow.parquet as pq
 
     writer: pq.ParquetWriter | None = None
@@ -105,6 +105,7 @@ def _format_cells(column: np.ndarray) -> list[str]:
     if column.dtype.kind != "f":
         return list(map(str, _convert_to_plain(column).tolist()))
     values, size = column.tolist(), np.abs(column.astype(np.float64))
+    # "[1.5,2.0]" as "[1.5,2.0,": each number is followed by a comma.
     text = msgspec.json.encode(values).decode().replace("]", ",")
     for digit in "6789":  # Python writes two digits of an exponent
         text = text.replace(f"e-{digit},", f"e-0{digit},")
@@ -117,12 +118,15 @@ def _format_cells(column: np.ndarray) -> list[str]:
 
 
 def predict_name_read_back(name: str) -> str:
-    """Return the name of a column as it reads from a CSV file to which it was written: in one line, without margins."""
+    """Return the name that a column has when it is read from the CSV file to which it was written.
+
+    Cells cannot hold every name: characters that cannot be printed are written as codes, blanks at the ends are lost.
+    """
     return unquote_cell(quote_for_cell(name).strip())
 
 
 def _convert_to_plain(column: np.ndarray) -> np.ndarray:
-    """Return dates as texts, flags as 1 and 0, and other numbers as they are."""
+    """Return a column with dates as texts and flags as 1 and 0; other numbers stay as they are."""
     if column.dtype.kind == "M":
         return format_dates(column)
     return column.astype(np.int64) if column.dtype == np.bool_ else column

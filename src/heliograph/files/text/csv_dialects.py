@@ -1,4 +1,7 @@
-"""Tables of other dialects: names in comments, other separators, doubled columns; and what rewrites them."""
+"""Tables in dialects of CSV that are not read: how they are recognised, and the pandas call that rewrites them.
+
+Such a table has names in comments, other separators than commas, or columns of the same name.
+"""
 
 import re
 from collections import Counter
@@ -27,7 +30,7 @@ def check_distinct(source: object, header: Sequence[object]) -> None:
 
 
 def check_header(source: str, header: Sequence[str], path: Path | None, marked: bool) -> None:
-    """Raise ValueError for the first line of a table that names no columns, with what rewrites the table.
+    """Raise ValueError if the first line of a table does not name columns; the error says how to rewrite the table.
 
     Args:
         source: the name of the table, for errors.
@@ -56,7 +59,7 @@ def check_header(source: str, header: Sequence[str], path: Path | None, marked: 
 
 
 def find_separator(header: Sequence[str]) -> str | None:
-    """Return what separates several names that were read as one; None if nothing does."""
+    """Return the separator (of SEPARATORS) in a header that was read as a single name; None if there is none."""
     return next((mark for mark in SEPARATORS if len(header) == 1 and mark in header[0]), None)
 
 

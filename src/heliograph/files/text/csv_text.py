@@ -53,8 +53,8 @@ class CsvReader:
     def __init__(self, source: str, path: Path | None, marked: bool):
         """Begin before the first line; `marked`: whether a line that begins with # may be a row and no comment."""
         self.source, self.path, self._marked = source, path, marked
-        self.header: list[str] = []
-        self.number = 0
+        self.header: list[str] = []  # [] until the line with the columns' names has come
+        self.number = 0  # of the last row
         self._open_lines: list[str] = []  # lines from the one that opened a quote, while it is not closed
 
     @property
@@ -63,9 +63,9 @@ class CsvReader:
         return bool(self._open_lines)
 
     def add(self, line: str) -> list[CsvRow | InputError]:
-        """Return the rows that a line completes, or errors for rows that cannot be read.
+        """Return the rows that a line completes, or errors for rows that cannot be read; none inside a quoted cell.
 
-        There are none within a quoted cell of several lines.
+        A cell in quotes may go on over several lines, and the row is complete only with the line that closes the quote.
 
         Raises:
             ValueError: the header names no columns, or a column twice.
@@ -76,13 +76,14 @@ class CsvReader:
         return self._read_lines_of_open_quote(ended=False)
 
     def end(self) -> list[CsvRow | InputError]:
-        """Return what is left at the end of the text."""
+        """Return the rows, or errors, of lines that are left at the end of the text, since a quote was not closed."""
         return self._read_lines_of_open_quote(ended=True)
 
     def _read_lines_of_open_quote(self, ended: bool) -> list[CsvRow | InputError]:
-        """Return the rows of the lines since a quote was opened, once it is closed.
+        """Return the rows of `self._open_lines`, the lines since a quote was opened; [] while it may still be closed.
 
-        Where it is not closed within OPEN lines, or at the end, its line is an error and the others are read anew.
+        If it is not closed within OPEN lines, or at the text's end (`ended`), its first line is an error, and the other
+        lines are read anew.
         """
         rows: list[CsvRow | InputError] = []
         while self._open_lines:
@@ -103,9 +104,13 @@ class CsvReader:
         return rows
 
     def _make_row(self, cells: list[str], broken: str = "") -> list[CsvRow | InputError]:
-        """Return the row of these cells, or why they are none; [] of a header, an annotation or an empty line.
+        """Return the row of these cells, or the error why they are no row, in a list.
 
-        `broken`: what is wrong with the line, if it is known already.
+        The list is empty for an empty line, an annotation of Influx and a header, which sets `self.header`. `broken`:
+        what is wrong with the line, if this is known already.
+
+        Raises:
+            ValueError: the header names no columns, or a column twice.
         """
         if not broken and not any(cell.strip() for cell in cells):
             return []
@@ -121,8 +126,10 @@ class CsvReader:
             return []
         self.number += 1
         where = f"{self.source}, row {self.number}"
-        why = fail(where, "a row of CSV", broken) if broken else self._find_row_error(where, cells)
-        return [CsvRow(where, self.number, self.header, [c.strip() for c in cells]) if why is None else why]
+        error = fail(where, "a row of CSV", broken) if broken else self._find_row_error(where, cells)
+        if error is not None:
+            return [error]
+        return [CsvRow(where, self.number, self.header, [cell.strip() for cell in cells])]
 
     def _find_row_error(self, where: str, cells: list[str]) -> InputError | None:
         """Return the error if the cells are no row of this table, or None if they are one.
@@ -142,7 +149,7 @@ class CsvReader:
 
 
 def read_csv_rows(path: Path, marked: bool) -> Iterator[CsvRow | InputError]:
-    """Yield the rows of a file of CSV, or why one cannot be read; `marked` is as of `CsvReader`.
+    """Yield the rows of a CSV file; an error stands in place of a row that cannot be read; `marked` as of `CsvReader`.
 
     Raises:
         ValueError: the header names no columns, or a packed file is damaged (the rows before are yielded).
@@ -169,7 +176,9 @@ def read_csv_header(path: Path) -> list[str]:
 
 
 def parse_cell(where: str, name: str, cell: str, path: Path | None) -> float:
-    """Return the number in a cell: 1 of true and 0 of false, NaN if it is empty or says that there is no value.
+    """Return the number in a cell: 1 for true and 0 for false, NaN if it is empty or a word for no value (NO_VALUE).
+
+    `where` and `name` are the cell's row and column, for the error. `path` is the table's file, if it can be rewritten.
 
     Raises:
         ValueError: the cell holds no number. The error says what is probably meant.

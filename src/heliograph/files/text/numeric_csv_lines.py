@@ -22,15 +22,15 @@ def parse_numeric_lines(lines: bytes, columns: int) -> Float[np.ndarray, "rows c
     rows = body.count(b"\n")
     if body.translate(None, NUMBERS) != empty_line * rows:
         return None
-    # A line without a number; a zero whose sign JSON takes for nothing.
+    # Leave to the slower reader a line without any number, and -0, whose sign JSON would lose.
     if b"\n" + empty_line in b"\n" + body or b"-0," in body or b"-0\n" in body:
         return None
-    # An empty cell stands between two commas, or at an end of its line; twice, since matches do not overlap.
+    # Write null into empty cells: between two commas (twice, since matches do not overlap), and at the ends of lines.
     body = body.replace(b",,", b",null,").replace(b",,", b",null,")
     body = body.replace(b",\n", b",null\n").replace(b"\n,", b"\nnull,")
     if body.startswith(b","):
         body = b"null" + body
-    # One list for all lines: of as many lists the collector of garbage would take more time than the rest.
+    # One list for all lines, since a list for each line would cost the garbage collector more time than all the rest.
     try:
         cells = msgspec.json.decode(b"[" + body[:-1].replace(b"\n", b",") + b"]", type=list[float | None])
     except msgspec.DecodeError:

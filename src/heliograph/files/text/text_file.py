@@ -84,7 +84,7 @@ def guess_encoding(start: bytes) -> str:
 
 
 def is_valid_text(line: str) -> bool:
-    """Return whether a line was text, and not bytes that had to be escaped."""
+    """Return whether a line is text, without NUL and without bytes that had to be escaped or replaced in decoding."""
     return (line.isascii() and "\0" not in line) or NO_TEXT.search(line) is None
 
 
@@ -118,8 +118,9 @@ def read_line_blocks(path: Path, size: int, progress: Progress | None = None) ->
     Raises:
         CutOffError: a packed file that is damaged or cut off; raised after the lines before the damage were yielded.
     """
-    # `rest`: the begin of a line whose end is in the next block.
-    total, rest, ended, damage = path.stat().st_size, b"", False, None
+    total = path.stat().st_size
+    rest = b""  # beginning of a line whose end is in the next block
+    ended, damage = False, None
     with path.open("rb") as file, _open_unpacked(file) as unpacked:
         try:
             decode = _make_decoder_to_utf8(unpacked)
@@ -127,9 +128,10 @@ def read_line_blocks(path: Path, size: int, progress: Progress | None = None) ->
             raise _describe_damage(path, error) from None
         while not ended:
             part, ended, damage = _read_bytes_of_part(unpacked, size)
-            # Whole lines end at the last line feed; at the end of an undamaged file the last line needs none.
-            text = rest + decode(part, ended and damage is None)
-            end = len(text) if ended and damage is None else text.rfind(b"\n") + 1
+            is_last = ended and damage is None
+            text = rest + decode(part, is_last)
+            # Whole lines end at the last line feed; the last line of an undamaged file needs none.
+            end = len(text) if is_last else text.rfind(b"\n") + 1
             if progress is not None:
                 progress(file.tell(), total)
             if end:
@@ -140,9 +142,9 @@ def read_line_blocks(path: Path, size: int, progress: Progress | None = None) ->
 
 
 def _read_bytes_of_part(file: "gzip.GzipFile | BufferedReader", size: int) -> tuple[bytes, bool, Exception | None]:
-    """Return three things: at most `size` bytes, whether the file ends with them, and an error or None.
+    """Return (bytes, whether the file ends with them, error): at most `size` bytes, `size` unless the file ends.
 
-    The error is one of DAMAGE, which unpacking raises if the file is damaged or was cut off.
+    The error is None, or one of DAMAGE, which unpacking raises if the file is damaged or was cut off.
     """
     parts, length = list[bytes](), 0
     try:
@@ -155,10 +157,10 @@ def _read_bytes_of_part(file: "gzip.GzipFile | BufferedReader", size: int) -> tu
 
 
 def _open_unpacked(file: BinaryIO) -> "gzip.GzipFile | BufferedReader":
-    """Return the same file, or what is packed in it.
+    """Return a file to read the text from: the file itself, or one that unpacks it if it is packed by gzip.
 
     Raises:
-        ValueError: what the file begins with is no text, nor packed by gzip.
+        ValueError: the file's first bytes are those of another kind (OTHER_KINDS).
     """
     buffered = cast(BufferedReader, file)
     start = buffered.peek(max(map(len, OTHER_KINDS)))
@@ -205,6 +207,6 @@ def yield_until_cut_off(parts: Iterable[T]) -> Iterator[T | CutOffError]:
 
 
 def _describe_damage(path: Path, error: Exception) -> CutOffError:
-    """Return in words what is wrong with a packed file."""
+    """Return the error that names a packed file and says whether it was cut off or how it is damaged."""
     came = "one that was cut off" if isinstance(error, EOFError) else str(error)
     return CutOffError(str(fail(str(path), "a packed file without damage", came)))

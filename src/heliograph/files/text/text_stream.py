@@ -1,4 +1,4 @@
-"""Bytes of a pipe to text in UTF-8, as they come: unpacked, and out of UTF-16."""
+"""Bytes of a pipe to text in UTF-8, as they come: gzip is unpacked, UTF-16 converted."""
 
 import codecs
 import zlib
@@ -57,7 +57,10 @@ class TextStream:
 
     @staticmethod
     def _may_be_no_text(start: bytes) -> bool:
-        """Return whether more bytes may show that these are no text in UTF-8."""
+        """Return whether these first bytes may be the beginning of another kind of file, or of packed text or UTF-16.
+
+        Then more bytes are needed to choose how the text is read.
+        """
         marks = (*OTHER_KINDS, GZIP, *WIDE, codecs.BOM_UTF8)
         return len(start) < len(WIDE[0]) or any(mark.startswith(start) for mark in marks if len(start) < len(mark))
 
@@ -77,15 +80,19 @@ class TextStream:
         return start.removeprefix(codecs.BOM_UTF8)
 
     def _unpack_bytes(self, data: bytes, ended: bool) -> bytes:
-        """Return what is packed in these bytes, a part of it at a time; nothing after damage."""
+        """Return the next part, of some AT_ONCE bytes, of what is packed in these bytes and in those that waited.
+
+        Nothing comes after damage, which `self.broken` describes. `ended`: no more bytes will come.
+        """
         packed, results = (self._packed or b"") + data, b""
         try:
             while packed and len(results) < AT_ONCE and not self.broken:
                 self._in_member = True
                 results += self._unpack.decompress(packed, AT_ONCE)
                 packed = self._unpack.unconsumed_tail
-                if self._unpack.eof:  # files one after another are one
-                    packed, self._in_member = self._unpack.unused_data.lstrip(b"\0"), False
+                if self._unpack.eof:  # another packed file may follow, which continues the text
+                    packed = self._unpack.unused_data.lstrip(b"\0")
+                    self._in_member = False
                     self._unpack = zlib.decompressobj(16 + zlib.MAX_WBITS)
         except zlib.error as error:
             self.broken = str(fail(self.source, "a packed file without damage", error))

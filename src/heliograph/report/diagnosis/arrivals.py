@@ -39,12 +39,12 @@ class Arrivals:
         time: times of the rows (time,), numbers or dates, each once.
         arrived: whether it arrived at each of them (time,).
         values: those that arrived.
-        may_be_lost: whether the network says that it may be lost, or is not always sent.
-        declared_period: rows between messages of a sender that says so (`Periodic`); None of others.
-        stated_share: probability of arrival by the network; None where it is not one number, as in bursts.
-        of_messages: whether each row is there because some node's message is, so that others are not due in it.
+        may_be_lost: whether the network's model says that it may be lost, or is not always sent.
+        declared_period: rows between messages, if the model has a `Periodic` sender; None for others.
+        stated_share: probability of arrival by the model; None where it is not one number, as in bursts.
+        of_messages: whether each row exists because one node's message came, so that others are not due in it.
         refuses: whether the node refuses values, beyond limits or stuck, which then are missing here.
-        watched: whether it refuses those that are stuck.
+        watched: whether it refuses values that are stuck.
     """
 
     node: str
@@ -61,11 +61,11 @@ class Arrivals:
 
     @cached_property
     def rate(self) -> SendingRate | None:
-        """Return the rate of a sender whose clock is not that of the rows, or None if there is no need of a rate.
+        """Return the rate of a sender whose clock is not that of the rows, or None if no such rate is needed.
 
-        There is none if the sender's period is declared, or if rows are there because of messages (`of_messages`). Nor
-        if a periodic pattern of rows, such as 3 of each 4, explains the arrivals as well: that with fewer messages due
-        is better, since fewer were then lost. `arrived`: for each row whether a message came.
+        It is not if the sender's period is declared, or if rows exist because of messages (`of_messages`). A periodic
+        pattern of rows, such as 3 of each 4, may also explain the arrivals: of the two, the one with fewer messages due
+        is taken, since fewer were then lost.
         """
         if self.declared_period is not None or self.of_messages:
             return None
@@ -84,8 +84,8 @@ class Arrivals:
 
         It is declared, or that of the sender's own clock (`rate`), or the median interval between arrivals, if a share
         REGULAR of all intervals are whole multiples of it to NEAR periods. (Losses of a sender that is due in each row
-        leave intervals of all lengths.) If rows are not there because of messages (`of_messages`), a median of less
-        than SLOWER rows is no period.
+        leave intervals of all lengths.) A median of less than SLOWER rows is no period, unless rows exist because of
+        messages (`of_messages`).
         """
         clock = _convert_times_to_numbers(self.time)
         spacing = float(np.median(np.diff(clock))) if len(clock) > 1 else 0.0
@@ -99,9 +99,9 @@ class Arrivals:
         period = float(np.median(intervals))
         if not self.of_messages and period < SLOWER * spacing:
             return None
-        # How far each interval is from the nearest whole number of periods, of one at least, in periods.
-        off_whole = np.abs(intervals / period - np.maximum(np.round(intervals / period), 1))
-        return period if np.mean(off_whole <= NEAR) >= REGULAR else None
+        # Distance of each interval from a whole number of periods, at least one, in periods.
+        distance = np.abs(intervals / period - np.maximum(np.round(intervals / period), 1))
+        return period if np.mean(distance <= NEAR) >= REGULAR else None
 
     @cached_property
     def slots(self) -> Bool[np.ndarray, " slots"] | None:
@@ -141,13 +141,13 @@ class Arrivals:
 
     @property
     def due_in(self) -> str:
-        """Return in words the rows or times in which a message is due: each slot (a row or a period), or a pattern."""
+        """Return in words when a message is due: "each row", "3 of 4 rows", "each 0.1", "3 of 4, each 0.1"."""
         if self.slots is None:
             return "not known"
-        some = None if self.pattern is None else f"{self.pattern.due} of {self.pattern.length}"
+        pattern = None if self.pattern is None else f"{self.pattern.due} of {self.pattern.length}"
         if self.period is None:
-            return "each row" if some is None else f"{some} rows"
-        return f"each {self.period:.4g}" if some is None else f"{some}, each {self.period:.4g}"
+            return "each row" if pattern is None else f"{pattern} rows"
+        return f"each {self.period:.4g}" if pattern is None else f"{pattern}, each {self.period:.4g}"
 
     @property
     def lost_times(self) -> np.ndarray:
@@ -155,17 +155,22 @@ class Arrivals:
 
         `slots`: whether a message came in each row, or, of a sender slower than the rows, in each `period`.
         """
-        if self.slots is None or not self.arrived.any():
-            return self.time[:0] if self.slots is None else self.time
+        if self.slots is None:
+            return self.time[:0]
+        if not self.arrived.any():
+            return self.time
+        # Slots in which a message was due and none came.
         due = np.ones(len(self.slots), dtype=bool) if self.pattern is None else self.pattern.rows
         lost = np.flatnonzero(~self.slots & due)
         if self.period is None:
             return self.time[lost]
-        clock, filled = _convert_times_to_numbers(self.time), np.flatnonzero(self.slots)
+        # Of a sender slower than the rows: times of the filled slots, those of the arrivals.
+        clock = _convert_times_to_numbers(self.time)
+        filled = np.flatnonzero(self.slots)
         times = clock[self.arrived]
         if len(filled) != len(times):  # several came in one slot: slots evenly from the first arrival to the last
             times = np.interp(filled, [filled[0], max(filled[-1], filled[0] + 1)], [times[0], times[-1]])
-        # Between arrivals by interpolation; after the last slot that is filled, a period each.
+        # Lost slots between arrivals are interpolated; those after the last filled slot follow it by a period each.
         lost_clock = np.interp(lost, filled, times) + np.maximum(lost - filled[-1], 0) * self.period
         if self.time.dtype.kind == "M":
             return np.asarray(self.time[0] + lost_clock * np.timedelta64(10**9, "ns"))
@@ -196,7 +201,7 @@ class Arrivals:
         The shares must also differ by more than a hundredth (LEAST_SHARE). Arrivals in bursts count as fewer
         independent ones: N (1 - a) / (1 + a), with the correlation a of each arrival with the next.
         """
-        p = self.stated_share  # probability of arrival that the network states; due_slots: whether each message came
+        p = self.stated_share  # probability of arrival by the model
         if p is None or self.due_slots is None or not 0 < p < 1:
             return False
         arrived = self.due_slots.astype(float)
@@ -209,7 +214,7 @@ class Arrivals:
         """Return the largest number of due messages in a row that did not arrive, or None if that is unknown."""
         if self.due_slots is None:
             return None
-        # As if a message had come before the first and after the last.
+        # Distances between arrivals, as if one had come before the first slot and one after the last.
         arrivals = np.flatnonzero(np.concatenate([[True], self.due_slots, [True]]))
         return int(np.max(np.diff(arrivals)) - 1)
 
@@ -225,7 +230,7 @@ def rows_are_messages(arrived: Mapping[str, Bool[np.ndarray, " time"]]) -> bool:
 
 
 def _convert_times_to_numbers(time: np.ndarray) -> Float[np.ndarray, " time"]:
-    """Return the times as numbers (time,): dates as seconds after the first."""
+    """Return the times as numbers (time,): dates as seconds after the first, others in their own unit."""
     if time.dtype.kind == "M":
         return np.asarray((time - time[0]) / np.timedelta64(1, "s"), dtype=float)
     return np.asarray(time, dtype=float)
@@ -257,13 +262,11 @@ def list_arrivals(network: Network, times: np.ndarray, received: Mapping[str, np
     for node, z in received.items():
         receiver = network.nodes[node]
         limits = receiver.limits
-        refuses_values, refuses_stuck_values = limits is not None, limits is not None and limits.stuck is not None
+        refuses_values = limits is not None
+        refuses_stuck_values = limits is not None and limits.stuck is not None
         declared = _read_declared_sending(receiver)
         for i, name in enumerate(receiver.received_names):
             arrived_in_row = ~np.isnan(z[:, i])
-            # A share is the fraction of values that arrive by the model. Numbers that come with the values, such as a
-            # mode, stand behind them and have none.
-            has_share = declared.shares is not None and i < len(declared.shares)
             links.append(
                 Arrivals(
                     node=node,
@@ -273,7 +276,7 @@ def list_arrivals(network: Network, times: np.ndarray, received: Mapping[str, np
                     values=z[arrived_in_row, i],
                     may_be_lost=declared.may_be_lost,
                     declared_period=declared.period,
-                    stated_share=float(declared.shares[i]) if has_share else None,
+                    stated_share=declared.find_share(i),
                     of_messages=of_messages,
                     refuses=refuses_values,
                     watched=refuses_stuck_values,
@@ -285,13 +288,20 @@ def list_arrivals(network: Network, times: np.ndarray, received: Mapping[str, np
 class _DeclaredSending(NamedTuple):
     """What the network says of a node's messages.
 
-    period: rows between two, of a sender that declares it (`Periodic`); None of others. may_be_lost: whether some may
-    not arrive. shares: probability of arrival of each received number; None where these are not single numbers.
+    period: rows between two, if it has a `Periodic` sender; None for others. may_be_lost: whether some may not arrive.
+    shares: probability of arrival of each received number (received,); None where these are not constant.
     """
 
     period: int | None
     may_be_lost: bool
-    shares: Any
+    shares: Float[np.ndarray, " received"] | None
+
+    def find_share(self, i: int) -> float | None:
+        """Return the probability that received number i arrives; None if it is not constant.
+
+        Numbers that come with the values, such as a mode, stand behind them and have none.
+        """
+        return None if self.shares is None or i >= len(self.shares) else float(self.shares[i])
 
 
 def _read_declared_sending(receiver: Any) -> _DeclaredSending:

@@ -42,7 +42,7 @@ class ConstantError(NamedTuple):
     nothing_else: bool = False
 
     def __str__(self) -> str:
-        """Return the output, or those it may be, and its error with half the 95 % interval: "c: y, of 1.0 ± 0.2"."""
+        """Return the output (or those that it may be) and its error, with half the 95 % interval: "y, of 1.0 ± 0.2"."""
         half_interval = 1.96 * self.standard_error
         size = f"{round_to(self.error, self.standard_error)} ± {round_to(half_interval, self.standard_error)}"
         return f"{' or '.join(self.outputs)}, of {size}"
@@ -54,7 +54,7 @@ def find_constant_error(
     measurements: Float[np.ndarray, "time m"],
     inputs: Float[np.ndarray, "time inputs"],
 ) -> ConstantError | None:
-    """Return the one output of several whose constant error explains innovations best; None where there is none.
+    """Return the output whose constant error explains the innovations best; None with one output or more than MOST.
 
     A constant b added to output j moves the innovations e of a filter by b r_j, of which the response r_j is found by
     adding a small step. With S their covariance, twice the logarithm of the likelihood ratio of b over 0 is greatest at
@@ -70,15 +70,16 @@ def find_constant_error(
     if not 2 <= len(names) <= MOST:
         return None
     outcome = filter.run(measurements, inputs)
-    e, s = np.asarray(outcome.innovations), np.asarray(outcome.innovation_covariances)
+    e = np.asarray(outcome.innovations)
+    s = np.asarray(outcome.innovation_covariances)
     arrived, variance = ~np.isnan(e), np.diagonal(s, axis1=1, axis2=2)
-    # Usual deviation of each output's innovations, the root of the median claimed variance; 0 where none arrived.
+    # Usual deviation of each output's innovations (m,): root of the median claimed variance, 0 if none arrived.
     by_output = zip(variance.T, arrived.T, strict=True)
     deviations = np.sqrt([np.median(claimed[came]) if came.any() else 0.0 for claimed, came in by_output])
     # Innovations in units of the claim, S^-1/2 e, which are white where it holds.
     whiten = _compute_inverse_square_roots(s, arrived)
     white = np.einsum("tij,tj->ti", whiten, np.where(arrived, e, 0.0))
-    # The likeliest error of each output by itself, where its innovations have a usable size.
+    # The likeliest error of each output by itself; outputs of which nothing usable arrived are left out.
     candidates = []
     for j in np.flatnonzero((deviations > 0) & np.isfinite(deviations)).tolist():
         response = np.where(arrived, _find_response(filter, measurements, inputs, e, j, deviations), 0.0)
@@ -172,7 +173,8 @@ def _estimate_error(
     """
     # r' w of each row; sum r' r and sum r' w over all rows.
     row_agreements = np.sum(white_response * white, axis=1)
-    weight, agreement = float(np.sum(white_response**2)), float(np.sum(white_response * white))
+    weight = float(np.sum(white_response**2))
+    agreement = float(np.sum(white_response * white))
     if not (weight > 0 and np.isfinite(agreement)):
         return None
     error = agreement / weight
@@ -199,15 +201,23 @@ def _find_response(
     output: int,
     deviations: Float[np.ndarray, " m"],
 ) -> Float[np.ndarray, "time m"]:
-    """Return the change of all innovations by an error of one in an output, 0 where an angle went around.
+    """Return the derivative of all innovations by a constant error of one output, 0 where an angle jumped by a turn.
 
-    `output`: its number. The filter is run again with a small step added, SMALL of the output's deviation.
+    It is a difference quotient: the filter is run again with a small step added to the output's measurements.
+
+    Args:
+        filter: the filter.
+        measurements: what it received (time, m).
+        inputs: its inputs (time, inputs).
+        innovations: its innovations without the step (time, m).
+        output: index of the output.
+        deviations: usual standard deviations of the outputs' innovations (m,); the step is SMALL of the output's.
     """
     step = SMALL * deviations[output]
     moved = np.array(measurements, dtype=float)
     moved[:, output] += step
     response = (np.asarray(filter.run(moved, inputs).innovations) - innovations) / step
-    # In units of the outputs' deviations no response is large, unless an angle has jumped by a turn.
+    # An error of one deviation of the output moves no innovation by LARGEST deviations, unless an angle has jumped.
     return np.where(np.abs(response) * deviations[output] < LARGEST * deviations, response, 0.0)
 
 

@@ -27,9 +27,9 @@ def say_overconfident(name: str, outputs: Sequence[str], sizes: Sequence[float])
 
 
 def say_innovation_is_impossible(name: str, found: ImpossibleInnovation, probability: float) -> str:
-    """Return the sentence on one innovation that is larger than any law with the claimed variance allows.
+    """Return the sentence on one innovation that is larger than any law with the claimed variance makes plausible.
 
-    `probability` is the largest with which one of all innovations is as large where the claim holds.
+    If the claim holds, any of the innovations is as large with at most this `probability`.
     """
     return (
         f"{name} is too sure, or the measurement is wrong: its innovation in row {found.row} is {found.deviations:.3g} "
@@ -87,7 +87,8 @@ def say_underconfident(name: str, outputs: Sequence[str], sizes: Sequence[float]
 def say_how_to_refuse_repeats(held: StuckValue, refused: bool) -> str:
     """Return words on an output that repeats a value: that it was refused, or how to have it refused.
 
-    `held.stuck` is how often a value may repeat before the option `stuck` refuses it.
+    `held.stuck` is how often a value may repeat before the option `stuck` of a node refuses it. `refused`: whether the
+    node has this option already.
     """
     if refused:
         return "what repeated for longer was refused"
@@ -98,9 +99,9 @@ def say_how_to_refuse_repeats(held: StuckValue, refused: bool) -> str:
 
 
 def say_declared_variances_are_off(judgements: Sequence[DeclaredJudgement], unit: str) -> list[str]:
-    """Return the sentences on variances that messages declare; with several links, their outputs are named.
+    """Return the sentences on noise variances that messages report; with several links, their outputs are named.
 
-    `unit` is that of the plant's time.
+    `judgements` compare the reported variances with the innovations, one for each link. `unit`: of the plant's time.
     """
     several = len(judgements) > 1
     return [

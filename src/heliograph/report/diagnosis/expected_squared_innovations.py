@@ -13,11 +13,11 @@ from heliograph.simulation.results.whiteness import MemoryTest
 def compute_expected_squares(
     filter: AbstractFilter, data: Float[np.ndarray, "steps m"], inputs: Float[np.ndarray, "steps inputs"]
 ) -> Float[np.ndarray, "steps m"]:
-    """Return the variance of each innovation given its recording, divided by its variance over all runs.
+    """Return the mean square, over its claimed variance, that the model expects of each innovation in this recording.
 
-    The ratio is 1 for most filters. Behind random gains it is not, since the state of this run differs from its mean
-    over all runs. There `given_record` returns another filter, whose covariances are given the data. Elsewhere it
-    returns the filter itself.
+    It is the innovation's variance given this recording, divided by its variance over all runs. That is 1 for most
+    filters. With random gains of the links it is not, since the state of this run differs from its mean over all runs.
+    Then `given_record` returns another filter, whose covariances are given the data; else it returns the filter itself.
     """
     conditioned = filter.given_record()
     if conditioned is filter:
@@ -33,7 +33,7 @@ def compute_expected_squares(
 def compute_ratio_of_squares(
     squares: Float[np.ndarray, " steps"], expected: Float[np.ndarray, " steps"]
 ) -> tuple[float, float]:
-    """Return the ratio of the mean square to the expected mean square, and its standard error; 1 means the claim holds.
+    """Return (ratio, standard error): the mean square over the expected mean square, which is 1 if the claim holds.
 
     Args:
         squares: squared innovations in units of their claim, NaN where there is none.
@@ -53,15 +53,18 @@ def compute_ratio_of_squares(
 def scale_size_to_expected(
     test: MemoryTest, white: Float[np.ndarray, "steps m"], expected: Float[np.ndarray, "steps m"]
 ) -> MemoryTest:
-    """Return the test with the innovations' size relative to the `expected` mean squares in this recording.
+    """Return the test with its mean square (`power`) divided by that which the model expects in this recording.
 
-    `white` holds innovations in units of their claimed deviations, NaN where none came. If all `expected` are 1, the
-    test is returned as it is.
+    Args:
+        test: test of the innovations' size and memory.
+        white: innovations in units of their claimed deviations (steps, m), NaN where none came.
+        expected: expected mean squares, as `compute_expected_squares` returns them. If all are 1, `test` is returned.
     """
     if np.all(expected == 1):
         return test
     came = ~np.isnan(white)
-    count = np.maximum(came.sum(axis=1), 1)  # how many numbers each row averages over
+    # Means over the numbers of each row; NaN in a row without any.
+    count = np.maximum(came.sum(axis=1), 1)
     mean_squares = np.where(came, white**2, 0.0).sum(axis=1) / count
     mean_expected = np.where(came, expected, 0.0).sum(axis=1) / count
     mean_squares = np.where(came.any(axis=1), mean_squares, np.nan)

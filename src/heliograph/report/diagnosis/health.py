@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -70,8 +71,16 @@ class FilterHealth:
 
     @property
     def numbers(self) -> int:
-        """Return how many innovations were tested; 0 where they are not known."""
+        """Return how many innovations were tested, over all rows and outputs; 0 for a filter without a claim."""
         return 0 if self.white is None else int(np.count_nonzero(~np.isnan(self.white)))
+
+
+class _MeanSquare(NamedTuple):
+    """Mean of innovation^2 / claimed variance, 1 where the claim holds; its standard error, and of how many numbers."""
+
+    size: float
+    error: float
+    numbers: int
 
 
 @dataclass(frozen=True)
@@ -81,12 +90,12 @@ class Health:
     record: Record
     links: list[Arrivals]
     filters: list[FilterHealth]
-    outputs: list[OutputHealth]  # by filter that claims a covariance
-    shared: dict[str, tuple[str, ...]]  # by its name, what several nodes share
-    beliefs: tuple[str, ...] = ()  # of filters that believe another world, one sentence each
+    outputs: list[OutputHealth]  # of each filter that claims a covariance
+    shared: dict[str, tuple[str, ...]]  # {name of what several nodes share: these nodes}
+    beliefs: tuple[str, ...] = ()  # a sentence on each filter whose model is not that of the network
     forecasts: Forecasts = field(default_factory=dict)  # by node and filter, where some were asked for
     predicted: Forecasts = field(default_factory=dict)  # of each row, by node and filter, where it was asked for
-    residuals: Residuals = field(default_factory=dict)  # of what was predicted, likewise
+    residuals: Residuals = field(default_factory=dict)  # (measured - predicted) / deviation, likewise
     constant_errors: Mapping[tuple[str, str], ConstantError] = field(
         default_factory=dict
     )  # by node and filter, where it says most
@@ -101,8 +110,10 @@ class Health:
         lines = [*self.record.failures(), *self.describe_stuck_outputs().values(), *self.doubtful_estimates]
         lines += [f"{node}: {found.describe()}" for node, found in self.silences.items()]
         lines += self._describe_losses()
-        lines += [] if self.error_between_nodes is None else [say_node_differs(self.error_between_nodes)]
-        lines += [self.time_unit] if self.time_unit else []
+        if self.error_between_nodes is not None:
+            lines.append(say_node_differs(self.error_between_nodes))
+        if self.time_unit:
+            lines.append(self.time_unit)
         return lines + [line for filter in self.list_doubted_filters() for line in self._describe_doubts(filter)]
 
     def _describe_losses(self) -> Iterator[str]:
@@ -122,16 +133,17 @@ class Health:
         """Return {(node, output): line} for each output that repeats one value for longer than its noise allows.
 
         Only filters that the network relies on (`trusted`) count. An output used by a node's filter and by a central
-        one has one line, from the node's filter. `watched`: outputs whose repeats limits refuse already.
+        one has one line, from the node's filter.
         """
         trusted = {(filter.node, filter.filter) for filter in self.filters if filter.trusted}
-        # Central filters first, whose outputs are named "node: output": a node's own filter takes their place.
+        # Central filters first, whose outputs are named "node: output": those of nodes' own filters replace them.
         held_outputs: dict[str, tuple[str, str, StuckValue]] = {}
         for health in sorted(self.outputs, key=lambda output: output.node != Network.FUSED):
             output = health.judged.output
             name = output if health.node == Network.FUSED else f"{health.node}: {output}"
             if health.judged.held is not None and (health.node, health.filter) in trusted:
                 held_outputs[name] = health.node, output, health.judged.held
+        # Outputs whose repeated values the node refuses already.
         watched = {f"{link.node}: {link.component}" for link in self.links if link.watched}
         return {
             (node, output): f"{name} is stuck, or has no noise: {held}, where its noise makes no run as long; "
@@ -154,7 +166,7 @@ class Health:
         return [health for health in self.filters if is_doubted(health)]
 
     def remarks(self) -> list[str]:
-        """Return one line for each doubt about a filter that is there to be compared with."""
+        """Return one line for each doubt about a filter that the network does not rely on, but has for comparison."""
         return [line for filter in self.filters if not filter.trusted for line in self._describe_doubts(filter)]
 
     def _describe_doubts(self, health: FilterHealth) -> Iterator[str]:
@@ -172,22 +184,25 @@ class Health:
             yield say_constant_error(name, error)
             if error.nothing_else:  # a constant error explains all other doubts too
                 return
-        said = say_declared_variances_are_off(health.declared, health.unit)
-        yield from (f"{name}: {sentence}" for sentence in said)
+        on_declared = say_declared_variances_are_off(health.declared, health.unit)
+        yield from (f"{name}: {sentence}" for sentence in on_declared)
         # Too few rows for a test: still, one innovation may be larger than chance allows among all numbers judged.
         if health.test is None:
             numbers = sum(filter.numbers for filter in self.filters)
             found = find_impossible_innovation(health.white, FALSE / numbers) if numbers else None
             if found is not None:
                 yield say_innovation_is_impossible(name, found, FALSE)
-        if said or health.test is None:  # the judgement of what was declared says more than sizes and memory do
+        if on_declared or health.test is None:  # wrong declared variances explain sizes and memory
             return
         yield from self._describe_sizes(health, health.test)
         if self._has_memory(health, health.test):
             yield say_innovations_are_correlated(name, health.test)
 
     def _level_of_one_test(self) -> float:
-        """Return the level of a test of one filter: all together are seldom wrong (Bonferroni)."""
+        """Return the probability of a false alarm that the test of one filter may have.
+
+        It is FALSE divided by the number of tested filters, so that all together are wrong with FALSE (Bonferroni).
+        """
         return FALSE / sum(filter.test is not None for filter in self.filters)
 
     def _describe_sizes(self, health: FilterHealth, test: MemoryTest) -> Iterator[str]:
@@ -198,18 +213,18 @@ class Health:
         mean square `power` and its standard error.
         """
         # `level`: probability of a false alarm that one test may have.
-        name, level = f"{health.node}/{health.filter}", self._level_of_one_test()
+        name = f"{health.node}/{health.filter}"
+        level = self._level_of_one_test()
         of_filter = [one for one in self.outputs if (one.node, one.filter) == (health.node, health.filter)]
-        # Outputs with enough innovations. `measured`: for each output the mean of innovation^2 / claimed variance, its
-        # standard error, and the number of innovations; under the name "" for all outputs together. `signs`: 1 of
-        # outputs that are significantly larger, -1 smaller, 0 neither.
+        # Mean squares of the outputs with enough innovations, and their signs: 1 if significantly too large, -1 if too
+        # small, else 0.
         judged = [output.judged for output in of_filter if output.judged.summary.received > LAGS]
-        measured = {output.output: (output.size, output.size_error, output.summary.received) for output in judged}
-        signs = {output: judge_size(*numbers, level / len(measured)) for output, numbers in measured.items()}
-        if not any(signs.values()):  # none is wrong by itself
-            measured = {"": (test.power, test.power_error, health.numbers)}
+        measured = {one.output: _MeanSquare(one.size, one.size_error, one.summary.received) for one in judged}
+        signs = {output: judge_size(*square, level / len(measured)) for output, square in measured.items()}
+        if not any(signs.values()):  # none is wrong by itself: judge all together, under the name ""
+            measured = {"": _MeanSquare(test.power, test.power_error, health.numbers)}
             signs = {"": judge_size(*measured[""], level)}
-        sizes = {output: size for output, (size, _, _) in measured.items()}
+        sizes = {output: square.size for output, square in measured.items()}
         larger = [output for output, sign in signs.items() if sign > 0]
         # An output that is far off spoils the estimates, so that others look a little larger too: these are not named.
         largest_excess = max((sizes[output] - 1 for output in larger), default=0.0)
@@ -222,9 +237,10 @@ class Health:
                 yield say(name, named if len(sizes) > 1 else [""], [sizes[output] for output in named])
 
     def explains_all_innovations(self, health: FilterHealth, error: ConstantError) -> bool:
-        """Return whether innovations without a constant error are as large as claimed and have no memory.
+        """Return whether the innovations of a filter, less the effect of a constant error, are as the filter claims.
 
-        `error.white` are these innovations over their deviations, and `error.squares` the squares, NaN where none came.
+        Then their squares are as large as claimed, and they are not correlated in time. `error.white` are these
+        innovations over their deviations, (time, m), and `error.squares` the squares, NaN where none came.
         """
         level = self._level_of_one_test() / error.squares.shape[1]
         for squares_of_output in error.squares.T:
@@ -248,7 +264,10 @@ class Health:
         return probability < self._level_of_one_test() and test.predictable - by_chance >= LEAST_SHARE
 
     def _describe_left_out(self, health: FilterHealth) -> Iterator[str]:
-        """Yield sentences on the outputs that a weighing filter left out most, in the words of `heliograph.run`."""
+        """Yield sentences on outputs of which a filter that weighs outliers down left out many values.
+
+        `heliograph.run` warns in the same words.
+        """
         for output in self.outputs:
             if output.weighs and (output.node, output.filter) == (health.node, health.filter):
                 yield from output.judged.summary.describe_left_out(

@@ -14,7 +14,7 @@ DRAWS = 20_000  # the median of this many is known to 1 % of a deviation
 def compute_innovation_medians(
     network: Network, node: str, variance: Float[np.ndarray, " received"]
 ) -> Float[np.ndarray, " received"]:
-    """Return the median of an innovation under the node's own law, by received number; 0 where the law is symmetric.
+    """Return the median that each received number's innovation has by the law of its noise; 0 if it is symmetric.
 
     A skewed noise has a median other than 0, which is no sign of a constant error. The innovation is taken for
     M (v - E v) + e: the sensor's noise v through the mean gain M of the link, and an independent Gaussian number e that
@@ -22,7 +22,8 @@ def compute_innovation_medians(
 
     Args:
         network: the network.
-        node: name of the node; of a filter of the centre, the nodes' numbers one after the other.
+        node: name of the node; or Network.FUSED for a filter at the centre, which receives all nodes' numbers one
+            after the other.
         variance: claimed variance of each innovation.
     """
     # The filter of the centre receives all nodes' numbers: each node's part by its own law.
@@ -35,7 +36,8 @@ def compute_innovation_medians(
         return np.zeros(receiver.received)
     # The median of a symmetric law is 0. It is taken for 0 too behind a link with memory, with delayed outputs
     # (`past`), or with other outputs than the received numbers, where M (v - E v) does not describe the innovation.
-    noise, channel = first(receiver.sensor).noise, first(receiver.channel).condition_on_arrival()
+    noise = first(receiver.sensor).noise
+    channel = first(receiver.channel).condition_on_arrival()
     if noise.is_symmetric or channel.remembers or channel.past or channel.outputs != receiver.received:
         return np.zeros(receiver.received)
     # M (v - E v) of drawn noises, (draws, received), with the mean gain M.

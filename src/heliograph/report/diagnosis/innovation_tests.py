@@ -15,9 +15,15 @@ LEAST_SIZE = 1.1  # ratio of a mean square to its claim, or the reverse, below w
 def judge_size(size: float, error: float, numbers: int, level: float) -> int:
     """Return 1 (too large) or -1 (too small) if a mean square differs from its claim, 1, significantly; else 0.
 
-    It must be off by its interval at `level`, and by the factor LEAST_SIZE. log(size) is nearly Gaussian with the
-    standard error error / size. Estimated from N `numbers` that error is itself uncertain, so it counts as at least
-    sqrt(2 / N), the one of N independent Gaussian numbers.
+    log(size) is nearly Gaussian with the standard error error / size. That is itself an estimate, so at least
+    sqrt(2 / N) is taken, its value for N independent Gaussian numbers. To be significant, the difference must also
+    exceed the factor LEAST_SIZE.
+
+    Args:
+        size: mean square of innovations over their claimed variance.
+        error: its standard error.
+        numbers: N, how many innovations it is the mean of.
+        level: probability of a false alarm.
     """
     if not (size > 0 and error > 0):
         return 0
@@ -42,8 +48,9 @@ def find_impossible_innovation(
     Gaussian noise nor a number of rows is needed.
 
     Args:
-        white: innovations in units of their claimed covariance, NaN where nothing arrived; None of a filter without.
-        probability: the largest that a number by itself may have to be called impossible.
+        white: innovations in units of their claimed covariance, NaN where nothing arrived; None for a filter without a
+            claim.
+        probability: an innovation is called impossible if one as large has less than this probability.
     """
     if white is None or not np.any(~np.isnan(white)):
         return None
@@ -56,14 +63,19 @@ def find_impossible_innovation(
 def subtract_mean(white: Float[np.ndarray, "steps m"]) -> Float[np.ndarray, "steps m"]:
     """Return the innovations minus the mean of each output.
 
-    If outliers lie to one side, the innovations that a filter keeps have a mean. It would look like memory.
+    If outliers lie to one side and a filter drops them, the innovations that it keeps have a mean other than 0. The
+    test for correlation in time would take it for memory.
     """
     count = np.maximum(np.sum(~np.isnan(white), axis=0), 1)
     return np.asarray(white - np.nansum(white, axis=0) / count)
 
 
 def find_memory(white: Float[np.ndarray, "steps m"]) -> MemoryTest | None:
-    """Return the test of innovations' correlation between messages, or None for too few (LAGS, 10) or all zeros."""
+    """Return the test whether innovations are correlated from message to message; None if there are too few for it.
+
+    It needs ten rows for each lag, more than LAGS numbers, and one that is not 0. Rows in which nothing came are left
+    out. `white`: innovations in units of their claimed covariance.
+    """
     came = white[~np.isnan(white).all(axis=1)]
     lags = min(LAGS, len(came) // 10)
     if not lags or np.count_nonzero(~np.isnan(came)) <= LAGS or not np.any(np.nan_to_num(came)):

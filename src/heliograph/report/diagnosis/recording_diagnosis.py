@@ -76,12 +76,12 @@ def examine(
     timeouts = {node: network.nodes[node].timeout for node in network.names}
     silences = find_long_silences(timeouts, record.measurements, u, network.inputs)
     health = Health(
-        record,
-        list_arrivals(network, record.time, record.measurements),
-        filters,
-        outputs,
-        network.shared,
-        beliefs,
+        record=record,
+        links=list_arrivals(network, record.time, record.measurements),
+        filters=filters,
+        outputs=outputs,
+        shared=network.shared,
+        beliefs=beliefs,
         doubtful_estimates=doubt_estimates(network, record),
         silences=silences,
     )
@@ -91,7 +91,7 @@ def examine(
 def _explain_doubts(network: Network, health: Health, inputs: np.ndarray) -> Health:
     """Return the diagnosis with what may explain doubts: a constant error of an output or node, another unit of time.
 
-    Where an output is stuck, no constant error between nodes is looked for.
+    A stuck output makes nodes disagree, too; then no constant error between nodes is looked for.
     """
     errors = {
         (filter.node, filter.filter): _find_constant_error(network, health, filter, inputs)
@@ -114,13 +114,17 @@ def _examine_filter(
     filter that claims no covariance, or receives nothing. `expected`: mean square of `white` that the model expects in
     this recording, which random gains may move from 1. `declared`: tests of noise variances reported with messages.
     """
-    node, name, filter, z = listener.node, listener.name, listener.filter, listener.measurements
+    node = listener.node
+    name = listener.name
+    filter = listener.filter
+    z = listener.measurements
     # Without a claim there is nothing to test; 1 is the mean square that a true claim gives.
     white, test, expected = None, None, np.ones(1)
     if filter.claim != "none" and filter.received:
         # Whiten the innovations, test their correlation over time (of a filter that weighs outliers down, about their
         # mean), and compare their size with the expected one.
-        white = np.asarray(score_innovations(filter, z, inputs)[1])
+        _, scores = score_innovations(filter, z, inputs)
+        white = np.asarray(scores)
         test = find_memory(subtract_mean(white) if weighs(filter) else white)
         expected = compute_expected_squares(filter, z, inputs)
         test = None if test is None else scale_size_to_expected(test, white, expected)
@@ -150,7 +154,7 @@ def _doubt_time_unit(network: Network, health: Health, inputs: np.ndarray) -> st
 
 
 def _find_judged_filter(network: Network, record: Record, judged: FilterHealth) -> FilterWithMeasurements:
-    """Return the filter that was judged, with what it listens to."""
+    """Return the filter whose innovations were judged, with its measurements."""
     listeners = yield_filters_with_measurements(network, record)
     return next(one for one in listeners if (one.node, one.name) == (judged.node, judged.filter))
 
@@ -170,7 +174,7 @@ def _find_constant_error(
 
 
 def _name_time_unit(record: Record) -> str:
-    """Return the unit of the times of a record, in words."""
+    """Return the name of the unit of a record's times: that of the column, "s" for dates, else a general phrase."""
     return record.units.get("time", "s" if record.time.dtype.kind == "M" else "of the unit of time")
 
 
@@ -181,6 +185,7 @@ def _check_record(network: Network, record: Record) -> None:
     filters = {node: set(network.nodes[node].filters) for node in network.names}
     if any(not names <= set(record.estimates.get(node, ())) for node, names in filters.items()):
         raise fail("record", "the run of this network", f"one of the nodes {', '.join(record.estimates)}")
-    for estimate in (estimate for of_node in record.estimates.values() for estimate in of_node.values()):
-        if estimate.mean.ndim != 2:
-            raise fail("record", "the run over one recording", f"estimates of shape {estimate.mean.shape}")
+    for estimates_of_node in record.estimates.values():
+        for estimate in estimates_of_node.values():
+            if estimate.mean.ndim != 2:  # means of one run have shape (rows, n)
+                raise fail("record", "the run over one recording", f"estimates of shape {estimate.mean.shape}")

@@ -13,26 +13,27 @@ CHANCE = 1e-4  # that losses at random are taken for a pattern, at most
 
 
 class SendingPattern(NamedTuple):
-    """A sender that is due in `due` of `length` rows, in `rows` (time,) of the table."""
+    """A periodic pattern of rows in which a sender's message is due: `due` of each `length` rows."""
 
     due: int
     length: int
-    rows: Bool[np.ndarray, " time"]
+    rows: Bool[np.ndarray, " time"]  # mask of the due rows of the table
 
 
 def find_pattern(arrived: Bool[np.ndarray, " time"]) -> SendingPattern | None:
     """Return the pattern of rows in which a message is due, or None if random losses could have left it.
 
-    A pattern: messages are due in `due` of each `length` rows, `rows` (time,); all other rows are empty. The due rows
-    may have a pattern themselves (`finer`, a mask over len(finer) due rows), and so on: the result is the finest one.
+    Messages are due in `due` of each `length` rows, and all other rows are empty. The due rows may have a pattern
+    themselves (`finer`, a mask over len(finer) due rows), and so on: the result is the finest one.
     """
-    rows, due, length = np.ones(len(arrived), dtype=bool), 1, 1
+    rows, due, length = np.ones(len(arrived), dtype=bool), 1, 1  # at first each row is due
     finer = _find_least_probable_rows(arrived[rows])
     while finer is not None:
         # Only the rows of `finer` among the due rows are due. Both patterns together repeat after some repetitions of
         # the first: the fewest for which repetitions * due is a multiple of len(finer).
         repetitions = len(finer) // np.gcd(due, len(finer))
-        due, length = int(finer.sum()) * due * repetitions // len(finer), length * repetitions
+        due = int(finer.sum()) * due * repetitions // len(finer)
+        length = length * repetitions
         rows[rows] = np.resize(finer, int(rows.sum()))
         finer = _find_least_probable_rows(arrived[rows])
     return None if length == 1 else SendingPattern(due, length, rows)
@@ -49,9 +50,11 @@ def _find_least_probable_rows(arrived: Bool[np.ndarray, " rows"]) -> Bool[np.nda
     # Losses at random, in bursts: a law fitted to the intervals between arrivals.
     arrivals = np.flatnonzero(arrived)
     intervals = np.diff(arrivals)
+    if not len(intervals):
+        return None
     law = BurstLossLaw.fit_to_intervals(intervals)
     least, found = np.log(CHANCE), None
-    for length in range(2, min(LONGEST, len(arrived) // 2) + 1 if len(intervals) else 0):
+    for length in range(2, min(LONGEST, len(arrived) // 2) + 1):
         pattern = np.bincount(arrivals % length, minlength=length) > 0
         if pattern.all():
             continue
@@ -80,10 +83,10 @@ class BurstLossLaw(NamedTuple):
 
     @staticmethod
     def fit_to_intervals(intervals: Int[np.ndarray, " arrivals"]) -> "BurstLossLaw":
-        """Return the law of greatest likelihood: shares of arrivals that follow one, and of losses that end a burst.
+        """Return the law of greatest likelihood for these intervals between arrivals, in rows.
 
-        An interval of 1 is an arrival in the row after an arrival. An interval of k > 1 has k - 1 losses, and the last
-        of them ends the burst.
+        `follows` is the share of arrivals that are in the row after an arrival (intervals of 1), and `ends` the share
+        of losses that end a burst. An interval of k > 1 has k - 1 losses, and the last of them ends the burst.
         """
         losses = intervals[intervals > 1] - 1
         return BurstLossLaw(
@@ -123,7 +126,10 @@ class BurstLossLaw(NamedTuple):
                 if scale == 0:
                     return -np.inf
                 log_scale += log(scale)
-                stay, stay_1, stay_2, later = stay / scale, stay_1 / scale, stay_2 / scale, later / scale
+                stay = stay / scale
+                stay_1 = stay_1 / scale
+                stay_2 = stay_2 / scale
+                later = later / scale
         return log_scale + (log(stay) if stay > 0 else -np.inf) - count * log_z
 
 

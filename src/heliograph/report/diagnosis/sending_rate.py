@@ -1,4 +1,4 @@
-"""Senders of a rate of their own among rows of another: told from losses by how seldom chance makes it."""
+"""Senders with a rate of their own among rows of another rate, distinguished from losses by a test against chance."""
 
 from typing import NamedTuple
 
@@ -10,10 +10,10 @@ from heliograph.report.diagnosis.sending_pattern import CHANCE, BurstLossLaw
 PEAKS = 8  # of the spectrum of arrivals that are looked at
 FEWEST = 8  # arrivals from which a rate is looked for
 ENOUGH = 20_000  # rows that decide
-ROUNDING = 1e-9  # periods: the arrivals at both ends of a line are in it
-STEPS = 18  # of the search for a rate, each to a half
-LINE_PARAMETERS = 5  # rate, phase, width, first and last row: N rows tell some N values of each apart
-OFF = 0.25  # periods by which a line at a peak of the spectrum is too wide, at most
+ROUNDING = 1e-9  # periods: the arrivals at both ends of the interval of phases are in it
+STEPS = 18  # of the bisection for a rate
+PARAMETERS = 5  # of a rate: it, phase, width, first and last row; N rows distinguish some N values of each
+OFF = 0.25  # periods by which the interval of phases at a peak of the spectrum is too wide, at most
 
 
 class SendingRate(NamedTuple):
@@ -27,15 +27,19 @@ class SendingRate(NamedTuple):
 
 
 class _PeriodicRows(NamedTuple):
-    """Rows r that come right after a multiple of the period: frac(frequency r - start) at most `width`."""
+    """Rows r that come right after a multiple of the period: frac(frequency r - start) <= width."""
 
-    frequency: float
-    start: float
-    width: float
+    frequency: float  # periods per row
+    start: float  # phase of the earliest row in its period
+    width: float  # of the interval of phases, in periods
 
     def phases(self, rows: Int[np.ndarray, " rows"]) -> Float[np.ndarray, " rows"]:
-        """Return how many periods after the first each row is."""
+        """Return the phase of each row, frequency r - start, in periods; its integer part numbers the period."""
         return np.asarray(self.frequency * rows - self.start)
+
+    def number_periods(self, rows: Int[np.ndarray, " rows"]) -> Int[np.ndarray, " rows"]:
+        """Return the number of the period in which each row is, the integer part of its phase."""
+        return np.asarray(np.floor(self.phases(rows)), dtype=np.int64)
 
 
 def find_rate(arrived: Bool[np.ndarray, " time"]) -> SendingRate | None:
@@ -60,10 +64,9 @@ def _find_slowest_rate(arrived: Bool[np.ndarray, " time"]) -> SendingRate | None
     """Return the slowest rate whose due rows hold all arrivals, if losses in bursts would hardly leave it; else None.
 
     A sender with its own clock sends at a rate below that of the rows, so that some rows are empty without a loss. It
-    may begin late and fall silent: the rows from its first arrival to its last decide, up to ENOUGH. The pattern of
-    such a rate is a line: the phases of arrivals (row times frequency, less whole periods) lie in a narrow interval.
-    Rows whose phase is in it are due. The pattern is accepted if losses in bursts would make it with a probability
-    below CHANCE.
+    may begin late and fall silent: the rows from its first arrival to its last decide, up to ENOUGH. Then the phases of
+    arrivals (row times frequency, less whole periods) lie in a narrow interval, and rows whose phase is in it are due.
+    A rate is accepted if losses in bursts would leave all other rows empty with a probability below CHANCE.
     """
     rows = np.flatnonzero(arrived)
     span = 1 + int(np.ptp(rows)) if len(rows) else 0  # rows from the first arrival to the last
@@ -72,28 +75,38 @@ def _find_slowest_rate(arrived: Bool[np.ndarray, " time"]) -> SendingRate | None
     if len(rows) < FEWEST or came_in_each_row:
         return None
     # Law of losses in bursts, the alternative explanation of empty rows.
-    loss_law, found = BurstLossLaw.fit_to_intervals(np.diff(rows)), None
+    loss_law = BurstLossLaw.fit_to_intervals(np.diff(rows))
+    found: SendingRate | None = None
     deciding_rows = rows[0] + np.arange(min(span, ENOUGH))
     arrivals_after_first = int(np.sum(rows <= deciding_rows[-1])) - 1
-    # Frequencies in cycles per row.
+    # Many rates are possible, and any would have been taken, so the chance of one is multiplied by their number.
+    log_number_of_rates = PARAMETERS * np.log(len(arrived))
     for frequency in _find_likely_frequencies(arrived):
-        # Due rows have phases in an interval of length 1 / T = frequency: the rest of the circle, about, is empty.
-        middle, gap = _find_largest_gap(frequency, rows)
-        if gap < 1 - frequency - OFF:
+        due_rows = _fit_rate(frequency, rows)
+        if due_rows is None:
             continue
-        # Each arrival has to be in a period of its own.
-        line = _fit_periodic_rows(frequency, rows, middle)
-        slots = np.floor(line.phases(rows)).astype(np.int64)
-        if line.width >= 1 or np.any(np.diff(slots) < 1):
-            continue
-        due = np.mod(line.phases(deciding_rows) + ROUNDING, 1) <= line.width + 2 * ROUNDING
-        # Many lines are possible, and any would have been taken, so the chance of one is multiplied by their number.
-        log_number_of_lines = LINE_PARAMETERS * np.log(len(arrived))
-        log_chance = loss_law.log_chance_within(due, arrivals_after_first) + log_number_of_lines
+        is_due = np.mod(due_rows.phases(deciding_rows) + ROUNDING, 1) <= due_rows.width + 2 * ROUNDING
+        log_chance = loss_law.log_chance_within(is_due, arrivals_after_first) + log_number_of_rates
         # If a frequency passes, its multiples do too: the sender's is the least.
-        if log_chance < np.log(CHANCE) and (found is None or line.frequency < 1 / found.period):
-            found = SendingRate(period=1 / line.frequency, slots=slots - slots[0])
+        if log_chance < np.log(CHANCE) and (found is None or due_rows.frequency < 1 / found.period):
+            slots = due_rows.number_periods(rows)
+            found = SendingRate(period=1 / due_rows.frequency, slots=slots - slots[0])
     return found
+
+
+def _fit_rate(frequency: float, rows: Int[np.ndarray, " arrivals"]) -> _PeriodicRows | None:
+    """Return the due rows of a sender near a frequency (in periods per row), or None if the arrivals' rows do not fit.
+
+    Each arrival has to be in a period of its own.
+    """
+    # Due rows have phases in an interval of length 1 / T = frequency: about the rest of the circle is empty.
+    middle, gap = _find_largest_gap(frequency, rows)
+    if gap < 1 - frequency - OFF:
+        return None
+    due_rows = _fit_periodic_rows(frequency, rows, middle)
+    if due_rows.width >= 1 or np.any(np.diff(due_rows.number_periods(rows)) < 1):
+        return None
+    return due_rows
 
 
 def _find_likely_frequencies(arrived: Bool[np.ndarray, " time"]) -> list[float]:
@@ -128,10 +141,16 @@ def _find_largest_gap(frequency: float, rows: Int[np.ndarray, " arrivals"]) -> t
 
 
 def _fit_periodic_rows(frequency: float, rows: Int[np.ndarray, " arrivals"], middle: float) -> _PeriodicRows:
-    """Return the narrowest line through arrivals' rows near a frequency; each keeps its whole number of periods.
+    """Return the rows of the sender's period near `frequency` that hold all arrivals with the least width of phases.
 
-    Then the width is a convex function of the frequency, and its slope is the distance of the rows of the largest and
-    the least phase: halves that cannot hold its minimum are cut off. `middle`: of the largest gap between phases.
+    The phase of the arrival in row r is f r - k, with k the number of its period at the given frequency, which is kept.
+    Then the width max(phase) - min(phase) is a convex function of f. Its slope is the distance between the rows of the
+    largest and the least phase, so bisection finds the minimum.
+
+    Args:
+        frequency: an approximate frequency, in periods per row.
+        rows: rows of the arrivals.
+        middle: phase in the middle of the largest gap between arrivals' phases, where periods are counted from.
     """
     whole_periods = np.floor(frequency * rows - middle)  # of each arrival, counted from the middle of the gap
     low, high = frequency - 1 / np.ptp(rows), frequency + 1 / np.ptp(rows)

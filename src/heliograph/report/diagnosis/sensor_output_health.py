@@ -6,7 +6,7 @@ down-weighted below 1/2. A listener is a filter with what it receives.
 
 from collections import Counter, defaultdict, deque
 from collections.abc import Iterator, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -61,6 +61,7 @@ def compute_filter_errors(record: Record) -> list[FilterErrors]:
             claimed = ~np.isnan(nees)
             has_nees = bool(claimed.any())
             per_state = nees / np.where(known > 0, known, np.nan)
+            _mean, error_of_mean = average_correlated(per_state) if has_nees else (np.nan, np.nan)
             results.append(
                 FilterErrors(
                     node=node,
@@ -69,16 +70,17 @@ def compute_filter_errors(record: Record) -> list[FilterErrors]:
                     rmse=rmse,
                     rmse_error=_estimate_rmse_errors(record, node, name, rmse),
                     nees=float(nees[claimed].sum() / known[claimed].sum()) if has_nees else np.nan,
-                    nees_error=average_correlated(per_state)[1] if has_nees else np.nan,
+                    nees_error=error_of_mean,
                 )
             )
     return results
 
 
 def _estimate_rmse_errors(record: Record, node: str, name: str, rmse: Mapping[str, float]) -> dict[str, float]:
-    """Return the standard error of each state's RMSE: that of the mean square divided by twice the RMSE.
+    """Return the standard error of each state's RMSE, NaN for an RMSE of 0.
 
-    It is NaN for an RMSE of 0. `rmse` holds by state the RMSE of the filter `name` at `node`.
+    With the mean square M = RMSE^2, to first order it is the standard error of M divided by 2 RMSE. `rmse` holds by
+    state the RMSE of the filter `name` at `node`.
     """
     truth = np.asarray(record.truth)
     squares = np.where(np.isnan(truth), np.nan, record.errors(node, name)) ** 2
@@ -92,10 +94,11 @@ def _estimate_rmse_errors(record: Record, node: str, name: str, rmse: Mapping[st
 class OutputJudgement(NamedTuple):
     """What the innovations of one filter say of one received number.
 
-    to_blame: whether more of its values are down-weighted than of the filter's others together, by an interval of the
-    difference, and the filter is one that the network relies on where any of these weighs. size: mean square of the
-    innovations that the filter used (of weight 1/2 or more) over their claimed variance, 1 where the claim holds, with
-    its standard error. held: the longest run of equal values, where chance makes none as long; None elsewhere.
+    to_blame: whether outliers come from this output: more of its values are down-weighted than of the filter's other
+    outputs together, by an interval of the difference, and the filter is one whose weights are believed (`blames`).
+    size: mean square of the innovations that the filter used (of weight 1/2 or more) over their claimed variance, 1
+    where the claim holds, with its standard error. held: the longest run of equal values, where chance makes none as
+    long; None elsewhere.
     """
 
     output: str
@@ -116,12 +119,12 @@ class OutputHealth(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Name the filter and the output, such as "radio/robust: left"."""
+        """Return the node, the filter and the output (`self.judged` is its judgement), such as "radio/robust: left"."""
         return visible(f"{self.node}/{self.filter}: {self.judged.output}")
 
     def __str__(self) -> str:
         """One line, such as "radio/robust: left: 7 of 200 down-weighted (2 % to 7 %), bias 0.14 +- 0.05"."""
-        # Its readings were weighted down more often than those of the other outputs.
+        # To blame: its values were weighted down more often than those of the other outputs.
         blame = "; to blame: more than of the others" if self.judged.to_blame else ""
         return f"{self.name}: {self.judged.summary}{blame}"
 
@@ -147,11 +150,13 @@ def yield_filters_with_measurements(network: Network, record: Record) -> Iterato
     A filter is trusted if the network relies on it. It blames (its weights decide which outputs are bad) if it weighs
     outputs and is trusted, or if it weighs outputs and no trusted filter of the node does.
     """
-    received, relied_on = record.measurements, _list_relied_on_filters(network)
+    received = record.measurements
+    relied_on = _list_relied_on_filters(network)
     for node, z in received.items():
-        filters, names = network.nodes[node].filters, list(network.nodes[node].received_names)
+        filters = network.nodes[node].filters
+        names = list(network.nodes[node].received_names)
         weighing = {name for name, filter in filters.items() if filter.received and weighs(filter)}
-        blaming = (weighing & relied_on[node]) or weighing
+        blaming = (weighing & relied_on[node]) or weighing  # trusted ones, or all if no trusted filter weighs
         for name, filter in filters.items():
             trusted, blames = name in relied_on[node], name in blaming
             yield FilterWithMeasurements(node, name, filter, z, names, trusted=trusted, blames=blames)
@@ -182,10 +187,16 @@ def _list_relied_on_filters(network: Network) -> dict[str, set[str]]:
 
 def weighs(filter: AbstractFilter) -> bool:
     """Return whether a filter weighs received components by how likely they are, as a filter against outliers does."""
-    # Only the shape of a correction is found, and nothing is computed. Its weight is None if the filter does not weigh.
+
+    def make_innovation(state: Any, z: Any) -> Any:
+        """Return the innovation of one correction of `state` by the received numbers z."""
+        _corrected, innovation = filter.correct(state, z)
+        return innovation
+
+    # Trace one correction without computing it: the innovation's weight is None if the filter does not weigh.
     with jax.enable_x64(True):
         state = jax.tree.map(np.asarray, filter.init())
-        innovation = jax.eval_shape(lambda before, z: filter.correct(before, z)[1], state, np.zeros(filter.received))
+        innovation = jax.eval_shape(make_innovation, state, np.zeros(filter.received))
     return innovation.weight is not None
 
 
@@ -213,15 +224,15 @@ def judge_outputs_of_filter(
             variance=np.diagonal(outcome.innovation_covariances, axis1=-2, axis2=-1),
             weight=np.ones_like(outcome.innovations),
         )
-    # Their expected variance, median and squares, by the claim and the law of the noise.
+    # What the model says of the innovations: variances, medians, mean squares in this recording, and laws of the noise.
     variance = np.asarray(innovations.variance)
     medians = compute_innovation_medians(network, listener.node, _median_over_time(variance))
     expected = compute_expected_squares(listener.filter, listener.measurements, inputs)
     laws = list_noise_laws(network, listener.node)
     # A message may report numbers that a filter takes as they are, such as its gain or a flag. Their innovations have
     # variance 0, and are not judged.
-    is_taken_as_told = np.any(variance == 0, axis=0) & ~np.any(variance > 0, axis=0)
-    outputs = np.flatnonzero(~is_taken_as_told)
+    is_taken_as_given = np.any(variance == 0, axis=0) & ~np.any(variance > 0, axis=0)
+    outputs = np.flatnonzero(~is_taken_as_given)
     judged = judge_outputs(
         names=[listener.outputs[i] for i in outputs],
         received=listener.measurements[:, outputs],
@@ -237,7 +248,7 @@ def judge_outputs_of_filter(
 
 
 def _median_over_time(variance: np.ndarray) -> np.ndarray:
-    """Return the median over time by output (m,) of variances (time, m), NaN where nothing arrived; 0 of none."""
+    """Return the median of each column (m,) of variances (time, m), without NaN; 0 for a column of NaN alone."""
     columns = [column[~np.isnan(column)] for column in variance.T]
     return np.array([np.median(column) if len(column) else 0.0 for column in columns])
 
@@ -264,17 +275,20 @@ def judge_outputs(
             measured from these.
         blames: whether the filter weighs outliers down, so that low weights tell which output has them.
         expected: expected squares of the innovations (time, m), as `compute_expected_squares` returns them.
-        laws: of each output's noise; None where they are not known.
+        laws: law of each output's noise, by which equal values are judged; None where they are not known.
     """
-    # Each bias, with both ends of its interval, less the median that the law of the noise explains.
+    # Subtract from each bias, and from both ends of its interval, the median that the law of the noise explains.
     summaries = [
         summary._replace(
             bias=summary.bias - median, bias_low=summary.bias_low - median, bias_high=summary.bias_high - median
         )
         for summary, median in zip(innovations.summarise(), medians, strict=True)
     ]
+    # Indices of the outputs of which significantly more values are down-weighted than of the others.
     outlying = InnovationSummary.find_outlying(summaries) if blames else []
-    squares, variance = innovations.square_used(), np.asarray(innovations.variance)
+    # Squares, over their variances, of the innovations that the filter used (time, m).
+    squares = innovations.square_used()
+    variance = np.asarray(innovations.variance)
     judged = []
     for i, (name, summary) in enumerate(zip(names, summaries, strict=True)):
         size, size_error = compute_ratio_of_squares(squares[:, i], expected[:, i])
@@ -307,9 +321,8 @@ class RecentInnovations:
         """Add a row: the innovation "value", "variance" and "weight" of each number, None if it did not arrive."""
         row = [outputs[field] for field in ("value", "variance", "weight")]
         self._rows[node, name].append(np.array(row, dtype=float))
-        self.left_out[node, name] += sum(
-            weight == 0 for weight in outputs["weight"]
-        )  # None (not arrived) does not count
+        # A number that did not arrive has the weight None, and does not count.
+        self.left_out[node, name] += sum(weight == 0 for weight in outputs["weight"])
 
     def summarise_outputs(self) -> list[OutputHealth]:
         """Return what the newest rows of each filter say about each of its outputs."""

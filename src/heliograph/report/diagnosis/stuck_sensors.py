@@ -29,7 +29,7 @@ class NoiseLaw(NamedTuple):
     total: float
 
 
-NO_LAW = NoiseLaw(np.ones(1), np.zeros(1), 0.0)  # of which the claimed variance tells
+NO_LAW = NoiseLaw(np.ones(1), np.zeros(1), 0.0)  # not known: the claimed variance of innovations is used alone
 
 
 def list_noise_laws(network: Network, node: str) -> list[NoiseLaw]:
@@ -48,8 +48,10 @@ def list_noise_laws(network: Network, node: str) -> list[NoiseLaw]:
     unknown = [NO_LAW] * receiver.received
     if not isinstance(receiver, Node):
         return unknown
-    # Each received number must be an output of the sensor, passed on unchanged; sensors that vary are read at step 0.
-    sensor, outputs = first(receiver.sensor), tuple(range(receiver.received))
+    # Each received number must be an output of the sensor, passed on unchanged; of a sensor that changes over time the
+    # first is taken.
+    sensor = first(receiver.sensor)
+    outputs = tuple(range(receiver.received))
     if len(sensor.outputs) != receiver.received or not delivers_as_sent(first(receiver.channel), outputs):
         return unknown
     # Probability, mean and variance of each Gaussian branch (outputs, branches).

@@ -20,7 +20,7 @@ def describe_wrong_time_unit(
     inputs: Float[np.ndarray, "time inputs"],
     names: Sequence[str],
 ) -> str:
-    """Return the sentence that times are in another unit, if innovations are as claimed in it and not else; or "".
+    """Return the sentence that times seem to be in another unit than the plant's; "" if they do not.
 
     A common error is a recording in milliseconds for a plant in seconds. The filter runs on the recording as it is, and
     with dt in other units. The sentence is returned if the innovations agree with their claimed covariances in another

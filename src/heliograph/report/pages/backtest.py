@@ -32,7 +32,7 @@ class CoverageMiss:
     """An interval that held another share of what came than it claims, by more than chance explains."""
 
     score: "heliograph.forecasting.Score"
-    level: int  # of SHARES
+    level: int  # index of the interval in SHARES, which claims the share CLAIMED[level]
 
     @property
     def excess(self) -> float:
@@ -43,12 +43,15 @@ class CoverageMiss:
     def chance(self) -> float:
         """Probability that an interval which holds what it claims is off as far to this side.
 
-        Of forecasts h rows ahead one in h is independent of the others; how many are inside has a binomial law.
+        Forecasts h rows ahead overlap, so that only one in h counts as independent: of n = compared / h values the
+        number inside the interval has the binomial law with the claimed share.
         """
         count = max(self.score.compared // self.score.horizon, 1)
-        claimed, inside = CLAIMED[self.level], self.score.coverage[self.level].value * count
-        if self.excess < 0:
+        claimed = CLAIMED[self.level]
+        inside = self.score.coverage[self.level].value * count
+        if self.excess < 0:  # P(at most as many inside), rounded up
             return float(bdtr(np.ceil(inside), count, claimed))
+        # P(at least as many inside), rounded down.
         return float(bdtrc(np.floor(inside) - 1, count, claimed)) if inside >= 1 else 1.0
 
     def describe(self) -> str:
@@ -56,7 +59,9 @@ class CoverageMiss:
 
         `self.level` is the interval's index in SHARES, and `self.excess` the share that it held minus that it claims.
         """
-        score, claim, share = self.score, SHARES[self.level], self.score.coverage[self.level]
+        score = self.score
+        claim = SHARES[self.level]
+        share = self.score.coverage[self.level]
         verdict = "too sure" if self.excess < 0 else "too cautious"
         forecast = f"{score.part} {score.name}, {score.horizon} ahead"
         return f"{forecast}: the interval of {claim} held {share.value:.1%} +- {share.error:.1%}: {verdict}"
@@ -103,17 +108,18 @@ def make_backtest_results(found: "heliograph.forecasting.Backtest", network: str
         refit: rows between fits of its free numbers; 0 by default, for none.
     """
     return ResultsContent(
-        {"coverage": _draw_coverage(found)},
-        lambda drawings: make_backtest_page(found, network, drawings, refit),
-        _list_all_numbers(found) | ({"refit": refit} if refit else {}),
+        figures={"coverage": _draw_coverage(found)},
+        page=lambda drawings: make_backtest_page(found, network, drawings, refit),
+        summary=_list_all_numbers(found) | ({"refit": refit} if refit else {}),
     )
 
 
 def judge_forecasts_of_filters(found: "heliograph.forecasting.Backtest") -> list[FilterVerdict]:
     """Return the verdict on each filter's forecast intervals, the filter with the largest share of misses first.
 
-    An interval claims to hold a share (SHARES) of what comes. It misses if the share that it held is more than FAR (3)
-    standard errors off, and if chance alone is off as far as seldom as such a distance.
+    An interval claims to hold a share (SHARES) of what comes. It is a miss if the share that it held differs from the
+    claim by more than FAR (3) of its standard errors, and the binomial probability of such a difference (`chance`) is
+    also below that of 3 standard errors under a normal law.
     """
     verdicts = []
     for name in dict.fromkeys(f"{score.node}/{score.filter}" for score in found.scores):
@@ -135,15 +141,15 @@ def describe_coverage_misses(found: "heliograph.forecasting.Backtest") -> list[s
 
 @matplotlib.rc_context(STYLE)
 def _draw_coverage(found: "heliograph.forecasting.Backtest") -> Figure:
-    """Draw the share within the interval of 80 % over the horizon, a panel a number and a line a filter.
+    """Draw how often what came was within the forecast's interval of 80 %, over the horizon.
 
-    `found` holds the scores of forecasts on recorded data. The share (coverage) says how often the value that was
-    forecast lay in the forecast's interval of 80 %; the dashed line is the claimed 80 %. Bars are 2 standard errors.
+    There is a panel for each forecast state or output (the first PANELS), and a line for each filter. The dashed line
+    is the claimed 80 %. Bars are 2 standard errors. `found` holds the scores of forecasts on recorded data.
     """
     numbers = list(dict.fromkeys((s.node, s.part, s.name) for s in found.scores))[:PANELS]
     filters = list(dict.fromkeys(s.filter for s in found.scores))
     nodes = {node for node, _, _ in numbers}
-    figure, panels = make_stacked_panels(len(numbers), 1.3, 0.9)
+    figure, panels = make_stacked_panels(len(numbers), height=1.3, margin=0.9)
     for axes, (node, part, name) in zip(panels, numbers, strict=True):
         for i, filter in enumerate(filters):
             scores = [s for s in found.scores if (s.node, s.part, s.name, s.filter) == (node, part, name, filter)]
@@ -209,9 +215,9 @@ def make_backtest_page(
 
 
 def _make_title(verdicts: Sequence[FilterVerdict]) -> str:
-    """Return the result in a line: what the forecasts of one or two filters are worth, or how many of more hold.
+    """Return the page's title: what the forecasts of one or two filters are worth, or of more how many hold.
 
-    The most doubtful verdict comes first, and is last in the line.
+    The most doubtful verdict is the first of `verdicts`, and is named last in the title.
     """
     if len(verdicts) > 2:
         count = sum(not verdict.misses for verdict in verdicts)

@@ -51,10 +51,10 @@ class DesignResults:
 def make_design_results(results: DesignResults) -> ResultsContent:
     """Return the content of the results folder of a design: figures, page, summary and the two networks' sources."""
     return ResultsContent(
-        draw_design_figures(results),
-        partial(make_design_page, results),
-        make_design_summary(results),
-        partial(write_networks, results),
+        figures=draw_design_figures(results),
+        page=partial(make_design_page, results),
+        summary=make_design_summary(results),
+        write_data=partial(write_networks, results),
     )
 
 
@@ -65,7 +65,7 @@ def write_networks(results: DesignResults, folder: Path) -> None:
 
 
 def compute_mean_powers(design: PowerDesign) -> dict[str, float]:
-    """Return the mean power of each transmitter, zero where it is only rounding of the total."""
+    """Return the mean power of each transmitter over time; one that is only rounding error of the total counts as 0."""
     mean = {name: float(np.mean(power)) for name, power in design.powers.items()}
     return {name: power if power > ROUNDING * design.total else 0.0 for name, power in mean.items()}
 
@@ -107,7 +107,10 @@ def draw_design_figures(results: DesignResults) -> dict[str, Figure]:
 
 @matplotlib.rc_context(STYLE)
 def draw_pareto_front(front: ErrorsOverPower, marks: Mapping[str, tuple[float, float]]) -> Figure:
-    """Plot error over total power: the least found, the lower bound, and named points (power, error)."""
+    """Plot error over total power: the least error found, the proven lower bound, and named points.
+
+    `marks`: {name: (power, error)} of points to mark, at most three.
+    """
     figure = Figure(figsize=(WIDTH, 3.4), layout="constrained")
     axes = figure.subplots()
     # A bound at some power holds for all smaller powers: hence steps.
@@ -128,7 +131,10 @@ def draw_pareto_front(front: ErrorsOverPower, marks: Mapping[str, tuple[float, f
 
 @matplotlib.rc_context(STYLE)
 def draw_powers(before: Mapping[str, float], after: Mapping[str, float]) -> Figure:
-    """Plot the mean power of each transmitter: bars of the design, marks of what it was; the MOST largest."""
+    """Plot the mean power of the MOST (40) strongest transmitters: a bar for the design, a mark for what it was.
+
+    `before` and `after` hold the powers by transmitter.
+    """
     largest_names = sorted(after, key=lambda name: -after[name])[:MOST]
     names = [name for name in after if name in largest_names]
     figure = Figure(figsize=(WIDTH, 0.9 + 0.28 * len(names)), layout="constrained")
@@ -160,7 +166,7 @@ def draw_error_map(sites: ErrorsOverSites) -> Figure:
 
 
 def make_design_page(results: DesignResults, drawings: Mapping[str, bytes]) -> Page:
-    """Return the page of a design; `drawings` holds each figure as SVG."""
+    """Return the page of a design; `drawings` holds each figure as SVG, by the names of `draw_design_figures`."""
     design = results.design
     sections = [_make_result_section(results), _make_front_section(drawings), _make_powers_section(results, drawings)]
     if results.map is not None:
@@ -214,7 +220,8 @@ def _make_powers_section(results: DesignResults, drawings: Mapping[str, bytes]) 
 
     `slope`: by transmitter the change of the error for one unit more of its mean power, negative where that helps.
     """
-    after, slope = compute_mean_powers(results.design), results.design.sensitivity
+    after = compute_mean_powers(results.design)
+    slope = results.design.sensitivity
     rows = [
         [visible(name), f"{results.before.get(name, float('nan')):.4g}", f"{power:.4g}",
          f"{np.max(results.design.powers[name]):.4g}", f"{max(-slope[name], 0.0):.3g}"]
@@ -231,7 +238,7 @@ def _make_powers_section(results: DesignResults, drawings: Mapping[str, bytes]) 
 
 
 def _make_map_section(drawings: Mapping[str, bytes]) -> Section:
-    """Return the section with the map of errors over places for one more."""
+    """Return the section with the map of the error over the places where a node may stand."""
     caption = "The least error at the design's total power, with the network standing as the map's function says."
     return Section("Where", [Picture(drawings["map"], "The error over places, with the best one.", caption)])
 
@@ -252,7 +259,7 @@ def _make_changes_section(results: DesignResults) -> Section:
 
 
 def _explain_how_to_run() -> Section:
-    """Return how to run the designed network."""
+    """Return the section on how to run the designed network."""
     commands = f"heliograph run {DESIGNED} --measurements data.csv --out estimates.csv"
     text = (
         f"`{DESIGNED}` is the network with these powers and the best linear filters for them; it reads `{SOURCE}`, "

@@ -34,11 +34,18 @@ class PlotColumn:
 
 @dataclass(frozen=True)
 class ExploredTable:
-    """A table by columns, and the first view of it. `name` distinguishes it from the others on the page.
+    """A table by columns, and the first view of it.
 
-    `dimensions` are the columns that identify a row, in the order in which they are offered; `x`, `panel` and `colour`
-    are those of the first view. `whole`: the dimensions of which the first view shows all values; of the others it
-    shows the first. `unordered`: a dimension without an order: points along it are not connected.
+    Args:
+        name: distinguishes it from the others on the page.
+        columns: values of each column by its name.
+        dimensions: columns that identify a row, in the order in which they are offered.
+        quantities: columns that can be plotted.
+        x: dimension along the x axis in the first view.
+        panel: dimension with a panel for each value.
+        colour: dimension with a colour for each value.
+        whole: dimensions of which the first view shows all values; of the others it shows the first.
+        unordered: a dimension without an order, so that points along it are not connected.
     """
 
     name: str
@@ -53,7 +60,10 @@ class ExploredTable:
 
 
 def make_explorable_page_html(page: Page, tables: Sequence[ExploredTable]) -> str:
-    """Return the HTML of a page with tables to explore before its sections; it loads no other file."""
+    """Return the HTML of a page with tables to explore before its sections.
+
+    It contains the tables as JSON, the program that draws them and the plotting library, so that it loads nothing else.
+    """
     data = json.dumps([asdict(table) for table in tables], ensure_ascii=False, separators=(",", ":"), allow_nan=False)
     return (
         make_template_environment()

@@ -59,7 +59,7 @@ class FitResults:
 
     @property
     def starts(self) -> dict[str, float]:
-        """Return the start value of each free number, by name."""
+        """Return {name of a free number: the value at which the fit started}."""
         parameters = self.fit.description.parameters
         return dict(zip([e.name for e in parameters.entries], parameters.entries_at(parameters.start), strict=True))
 
@@ -67,8 +67,9 @@ class FitResults:
 def draw_fit_figures(learned: FitResults) -> dict[str, Figure]:
     """Return figures by file name: estimates, correlations of innovations before and after the fit, and PITs.
 
-    PITs are probability integral transforms of what was received. They are uniform if the network is right. A figure
-    has at most MOST filters.
+    PITs are probability integral transforms of what was received: the probability, by the network, of a smaller value.
+    They are uniform if the network is right. A figure has at most MOST filters or nodes. Figures without data are left
+    out.
     """
     figures = {"estimates": _draw_estimates(learned)}
     with_tests = [change for change in learned.changes if change.before.test and change.after.test]
@@ -82,19 +83,23 @@ def draw_fit_figures(learned: FitResults) -> dict[str, Figure]:
 
 @matplotlib.rc_context(STYLE)
 def _draw_estimates(learned: FitResults) -> Figure:
-    """Draw a panel for each number, since units differ: start, estimates by both forms of the likelihood, intervals."""
+    """Draw the estimates with intervals and start values, a panel for each free number, since units differ.
+
+    There is an estimate for each form of the likelihood: "linear" takes what random gains add to the variance from
+    moments before any data, "conditional" from moments given the data. The best form is drawn in blue.
+    """
     rows = learned.fit.rows()[:MOST]
-    # Of the two forms of the likelihood the one that counts is last. It is drawn at height 0, the other below at -1.
+    # The best form is the last of the solutions. It is drawn at height 0, another one below it at -1.
     forms = [solution.form for solution in reversed(learned.fit.solutions)]
     by_form = [learned.fit.rows(form=form) for form in forms]
-    figure, grid = make_stacked_panels(len(rows), 0.62, 0.6, sharex=False)
+    figure, grid = make_stacked_panels(len(rows), height=0.62, margin=0.6, sharex=False)
     for i, (axes, row) in enumerate(zip(grid, rows, strict=True)):
         for height, estimates in enumerate(by_form):
             color, width = (BLUE, 3.0) if height == 0 else (MUTED, 1.5)
             _draw_estimate(axes, estimates[i], -height, color, width)
         start = learned.starts[row.name]  # a triangle above
         axes.plot(start, 0.6, "v", color=AMBER, markersize=5, clip_on=False)
-        # A positive number that is known to a factor of ten or worse is shown by its logarithm.
+        # A positive number whose panel spans more than a factor of ten gets a logarithmic axis.
         shown = [row.low, row.high, row.estimate, start]
         if min(shown) > 0 and max(shown) > LOGARITHMIC * min(shown):
             axes.set_xscale("log")
@@ -117,8 +122,9 @@ def _draw_estimate(axes: Axes, row: Row, height: float, color: str, width: float
 @matplotlib.rc_context(STYLE)
 def _draw_correlations(tested: list[PredictionBeforeAndAfter]) -> Figure:
     """Draw the correlations of innovations some rows apart, before and after learning, with 95 % intervals."""
-    figure, grid = make_stacked_panels(len(tested), 1.6, 0.7)
+    figure, grid = make_stacked_panels(len(tested), height=1.6, margin=0.7)
     for axes, change in zip(grid, tested, strict=True):
+        # Bars before learning stand left of each lag, those after it right.
         sides = ((-0.17, AMBER, change.before.test, "before"), (0.17, BLUE, change.after.test, "after"))
         for shift, color, test, label in sides:
             assert test is not None
@@ -136,8 +142,11 @@ def _draw_correlations(tested: list[PredictionBeforeAndAfter]) -> Figure:
 
 @matplotlib.rc_context(STYLE)
 def _draw_probability_transforms(received: list[HeldOutTransforms]) -> Figure:
-    """Draw the histogram of each node's probability integral transforms, with the band of 95 % of a uniform law."""
-    figure, grid = make_stacked_panels(len(received), 1.5, 0.7)
+    """Draw the histogram of each node's probability integral transforms, which are uniform if the network is right.
+
+    The grey band holds 95 % of the bars then.
+    """
+    figure, grid = make_stacked_panels(len(received), height=1.5, margin=0.7)
     edges = np.linspace(0, 1, BINS + 1).tolist()
     for axes, transforms in zip(grid, received, strict=True):
         values = transforms.pit[~np.isnan(transforms.pit)]
@@ -154,7 +163,7 @@ def _draw_probability_transforms(received: list[HeldOutTransforms]) -> Figure:
 
 
 def make_fit_page(learned: FitResults, drawings: Mapping[str, bytes]) -> Page:
-    """Return the page of a fit; `drawings` holds each figure as SVG."""
+    """Return the page of a fit; `drawings` holds each figure as SVG, by the names of `draw_fit_figures`."""
     return Page(
         kicker="Heliograph fit",
         title=_make_headline(learned),
@@ -179,7 +188,10 @@ def _make_headline(learned: FitResults) -> str:
 
 
 def _summarise_gain(learned: FitResults) -> str:
-    """Return whether the first filter predicts the held-out rows better than before, and from what was learned."""
+    """Return the page's lead: whether the first filter predicts the held-out rows better after the fit than before.
+
+    It also says from which recording, and for which network. A gain is significant beyond 1.96 standard errors.
+    """
     source = f"From `{visible(learned.measurements)}`, for the network `{visible(learned.network)}`."
     gains = [(change, change.gain) for change in learned.changes if change.gain is not None]
     if not gains:
@@ -217,10 +229,9 @@ def _list_key_figures(learned: FitResults) -> list[KeyFigures]:
 def _make_estimates_table(learned: FitResults, drawings: Mapping[str, bytes]) -> list[Picture | Table]:
     """Return the figure of the estimates, and the table with start, estimate and interval of each number.
 
-    A fit finds unknown numbers of a model by maximum likelihood. The likelihood has a form: "linear" takes what a
-    random gain adds to the variance from the state's moments before any data, "conditional" from its moments given the
-    data, and "truth" is the density of the true states. `learned` has the fit and the numbers at which it started;
-    `drawings` has each figure as SVG, by name.
+    The form of the likelihood has a column: "linear" takes what a random gain adds to the variance from the state's
+    moments before any data, "conditional" from its moments given the data, and "truth" is the density of known true
+    states. `learned.fit.table` has a row of texts (value, interval, form) for each number. `drawings`: figures as SVG.
     """
     picture = Picture(
         drawings["estimates"],
@@ -246,7 +257,7 @@ def _make_estimates_table(learned: FitResults, drawings: Mapping[str, bytes]) ->
 
 
 def _list_sentences(learned: FitResults) -> list[Points | Text]:
-    """Return the fit's sentences, as points."""
+    """Return the sentences on what is doubtful about the fit, as points; a sentence that all is well without any."""
     sentences = learned.fit.sentences
     if sentences:
         return [Points([visible(sentence) for sentence in sentences])]
@@ -295,7 +306,7 @@ def _make_changes_table(learned: FitResults) -> Table:
 
 
 def _make_losses_section(learned: FitResults) -> list[Section]:
-    """Return the section on the laws of lost measurements; none where none were lost."""
+    """Return the section on the laws (models) of lost measurements; [] if no measurement was lost."""
     # One row for each law of each node: its first four parameters, and gain on held-out packets.
     rows = []
     for node, losses in learned.losses.items():
@@ -315,14 +326,15 @@ def _make_losses_section(learned: FitResults) -> list[Section]:
 
 
 def _make_delays_section(learned: FitResults) -> list[Section]:
-    """Return the section on how late the measurements of events were; none without events."""
+    """Return the section on how late measurements arrived; [] unless the fit was to events with times of arrival."""
     rows = [
         [visible(node), f"{steps * delays.step:g}", f"{share.estimate:.3f}", f"{share.low:.3f} to {share.high:.3f}"]
         for node, delays in learned.fit.delays.items()
         for steps, share in delays.shares.items()
     ]
     caption = (
-        "How long measurements were on their way, in steps, with the probability of each delay and its 95 % interval. "
+        "How long measurements were on their way, to the nearest step, with the probability of each delay and its 95 % "
+        "interval. "
         "`delays[node].law` of a fit is the law, for `hg.model.delayed(link, law)`."
     )
     table = Table(["node", "seconds late", "probability", "95 %"], rows, caption)

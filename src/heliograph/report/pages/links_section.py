@@ -19,7 +19,7 @@ from heliograph.simulation.network import Network
 
 @matplotlib.rc_context(LOOK)
 def draw_deliveries(health: Health) -> Figure:
-    """Draw when each component arrived and when it was lost, a line each."""
+    """Draw when each component arrived (blue marks) and when it was lost (orange, below), a row for each component."""
     links = health.links[:MOST]
     figure = Figure(figsize=(WIDTH, 0.8 + 0.28 * len(links)), layout="constrained")
     axes = figure.subplots()
@@ -102,15 +102,16 @@ def _list_refused(health: Health) -> list[Table]:
         by = f"{refusal.node}/{refusal.filter}" if refusal.filter else refusal.node
         rows.append([visible(name), f"{refusal.count:,}", WORDS[refusal.reason], visible(by), f"{refusal.row + 1:,}"])
     for node, counts in health.refused_messages.items():
-        said = [(WORDS[reason].removeprefix("of "), count) for reason, count in counts.items()]
-        rows += [[visible(node), f"{count:,}", words, visible(node), "–"] for words, count in said]
+        for reason, count in counts.items():
+            words = WORDS[reason].removeprefix("of ")
+            rows.append([visible(node), f"{count:,}", words, visible(node), "–"])
     headers = ["refused", "how many", "reason", "by", "first in row"]
     caption = "What came and was not used: single readings, and messages as a whole, which are none of the rows."
     return [Table(headers, rows, caption, wordy=True)] if rows else []
 
 
 def _caption_deliveries(health: Health) -> str:
-    """Return the caption of the figure of deliveries, which explains the marks that the figure has."""
+    """Return the caption of the figure of deliveries; it explains only the marks that the figure has."""
     arrived = any(link.arrived.any() for link in health.links)
     lost = any(len(link.lost_times) for link in health.links)
     if arrived and lost:
@@ -123,7 +124,7 @@ def _caption_deliveries(health: Health) -> str:
 
 
 def _format_share(link: Arrivals, form: str, unknown: str) -> str:
-    """Return the share of a link's messages that arrived, in this form; `unknown` if nobody knows what was due."""
+    """Return the share of a link's due messages that arrived, in the format `form`; `unknown` if it is not known."""
     return unknown if link.due is None else form.format(link.share)
 
 
@@ -144,7 +145,10 @@ def _format_mean_and_deviation(values: np.ndarray) -> tuple[str, str]:
 
 
 def describe_shared_links(shared: Mapping[str, tuple[str, ...]]) -> list[Text]:
-    """Return a sentence for each state that nodes' links share; [] if all links are independent."""
+    """Return a sentence for each random state that several nodes' links share, such as fading; [] if none is shared.
+
+    `shared`: {name of the state: nodes that share it}.
+    """
     sentences = [
         f"{', '.join(map(visible, nodes))} share {visible(name)}: their links are in one state at each step."
         for name, nodes in shared.items()

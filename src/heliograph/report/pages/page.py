@@ -107,7 +107,7 @@ class Judged:
 
     @property
     def word(self) -> str:
-        """Return the verdict in words."""
+        """Return the verdict in words, such as "does not apply"."""
         return VERDICTS[self.verdict]
 
 
@@ -210,7 +210,7 @@ class Page:
 
     @property
     def has_choice(self) -> bool:
-        """Test whether something is chosen from a list, which takes a script."""
+        """Return whether a picture is chosen from a list, for which the page needs a script."""
         return any(block.kind == "choice" for section in self.sections for block in section.blocks)
 
     def html(self) -> str:
@@ -219,7 +219,7 @@ class Page:
 
 
 def make_template_environment() -> Environment:
-    """Return the environment of this room's templates, in which all values are escaped."""
+    """Return the environment of Jinja for this package's templates, in which all values are escaped for HTML."""
     templates = Environment(
         loader=PackageLoader("heliograph.report.pages", "."),
         autoescape=True,

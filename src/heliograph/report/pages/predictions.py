@@ -26,9 +26,10 @@ PANELS = 12  # numbers of a node that are drawn; the table of estimates has all
 
 
 def draw_predicted_figures(health: Health) -> dict[str, Figure]:
-    """Return {file name: figure} of predictions by node and of residuals by filter; {} unless asked for.
+    """Return {file name: figure} of predictions by node and of residuals by filter; {} if there are no predictions.
 
-    At most MOST of each are drawn. Each row is predicted from earlier rows. Residuals are what was not predicted.
+    Each row is predicted from the rows before it; residuals are measurements minus predictions, in units of the claimed
+    deviation. At most MOST figures of each kind are drawn.
     """
     nodes = _list_predicting_nodes(health)[:MOST]
     figures = {f"predicted_{i}": _draw_predicted(health, node) for i, node in enumerate(nodes)}
@@ -69,7 +70,7 @@ def make_predicted_sections(health: Health, drawings: Mapping[str, bytes]) -> li
 
 
 def _list_residuals(health: Health) -> "list[tuple[str, heliograph.forecasting.Residuals]]":
-    """Return ("node/filter", residuals: what it did not predict) of each filter."""
+    """Return ("node/filter", its residuals (z - E z) / deviation with tests) of each filter."""
     return [(f"{node}/{name}", one) for node, filters in health.residuals.items() for name, one in filters.items()]
 
 
@@ -104,14 +105,17 @@ def _list_predicting_nodes(health: Health) -> list[str]:
 def _draw_predicted(health: Health, node: str) -> Figure:
     """Draw what filters of a node predicted of each number that arrives, with bands and the data, a panel each."""
     record, filters = health.record, health.predicted[node]
+    # By filter mean and deviation of each number that arrives (rows, numbers); and the data (rows, numbers). The fusion
+    # centre, which is no key of the measurements, receives the numbers of all nodes.
     laws = {name: forecast.received for name, forecast in filters.items() if forecast.received is not None}
     names = next(iter(laws.values())).names
     z = record.measurements.get(node)
     data = np.concatenate(list(record.measurements.values()), axis=1) if z is None else z
-    figure, panels = make_stacked_panels(min(len(names), PANELS), 1.7, 0.8)
+    figure, panels = make_stacked_panels(min(len(names), PANELS), height=1.7, margin=0.8)
     for i, panel in enumerate(panels):
         for (name, law), colour in zip(laws.items(), COLOURS, strict=False):
             mean, band = law.mean[:, i], BAND * law.deviation[:, i]
+            # An angle that jumps by a turn leaves a gap in the line.
             time, mean, band = insert_gaps(record.time, find_wraps(mean, np.pi), mean, band)
             panel.plot(time, mean, color=colour, linewidth=1.2, label=quote_for_figure(name))
             panel.fill_between(time, mean - band, mean + band, color=colour, alpha=0.2, linewidth=0)

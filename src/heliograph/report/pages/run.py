@@ -54,14 +54,20 @@ DOUBTS = 3  # that the page shows; `summary.json` has all
 
 
 def make_run_results(health: Health, network: str) -> ResultsContent:
-    """Return the content of the results folder; `network` is the user's name of the network."""
+    """Return the content of a run's results folder: figures, page and summary.
+
+    `health`: the record of the run with its diagnosis. `network`: the user's name of the network.
+    """
     return ResultsContent(
-        run_figures(health), partial(run_page, health, network), run_summary(health), lambda folder: None
+        figures=run_figures(health), page=partial(run_page, health, network), summary=run_summary(health)
     )
 
 
 def make_results_of_plants(examined: Mapping[str, Health], network: str) -> ResultsContent:
-    """Return the results of several plants: an overview, with the most doubted plants first, and a folder for each."""
+    """Return the results of several plants: an overview, with the most doubted plants first, and a folder for each.
+
+    `examined`: the diagnosis of each plant's run, by the plant's name. `network`: the user's name of the network.
+    """
     folders = {plant: f"plant.{quote(plant, safe='')}" for plant in examined}
 
     def write(folder: Path) -> None:
@@ -72,7 +78,12 @@ def make_results_of_plants(examined: Mapping[str, Health], network: str) -> Resu
             write_into_folder(make_run_results(health, f"{network}, {plant}"), subfolder)
 
     summary: dict[str, Json] = {plant: run_summary(health) for plant, health in examined.items()}
-    return ResultsContent({}, lambda _: _make_overview(examined, network, folders), summary, write)
+    return ResultsContent(
+        figures={},
+        page=lambda drawings: _make_overview(examined, network, folders),
+        summary=summary,
+        write_data=write,
+    )
 
 
 def _make_overview(examined: Mapping[str, Health], network: str, folders: Mapping[str, str]) -> Page:
@@ -108,7 +119,7 @@ def run_figures(health: Health) -> dict[str, Figure]:
     drawn: dict[str, Figure] = {}
     if find_coordinates(health.record.states) is not None:
         for kind, record in _collect_estimates(health):
-            node = _choose_nodes_to_draw(record)[0]
+            node, *_others = _choose_nodes_to_draw(record)
             drawn[_name_position_map(kind)] = draw_position_map(
                 record, node, list(record.estimates[node])[: len(COLOURS)]
             )
@@ -126,23 +137,23 @@ def run_figures(health: Health) -> dict[str, Figure]:
 
 
 def _name_position_map(kind: str) -> str:
-    """Return the name of the map of filtered or of smoothed estimates."""
+    """Return the file name of the map of estimates of a kind: "map" for "estimates", "map_smoothed" for "smoothed"."""
     return "map" if kind == "estimates" else f"map_{kind}"
 
 
 def _collect_estimates(health: Health) -> list[tuple[str, Record]]:
-    """Return ("estimates", record), and ("smoothed", smoothed record) if there is one."""
-    later = health.record.smoothed
-    return [("estimates", health.record)] + ([] if later is None else [("smoothed", later)])
+    """Return the records to draw with their kinds: ("estimates", record), and ("smoothed", record) if there is one."""
+    smoothed = health.record.smoothed
+    return [("estimates", health.record)] + ([] if smoothed is None else [("smoothed", smoothed)])
 
 
 def _choose_nodes_to_draw(record: Record) -> list[str]:
-    """Return the nodes that are drawn, the fused estimate first."""
+    """Return the first MOST of the nodes that have estimates, the fusion centre first."""
     return _sort_nodes(record)[:MOST]
 
 
 def _sort_nodes(record: Record) -> list[str]:
-    """Return the nodes that have estimates, the fused estimate first."""
+    """Return the nodes that have estimates, the fusion centre (Network.FUSED) first."""
     nodes = [node for node, filters in record.estimates.items() if filters]
     return sorted(nodes, key=lambda node: node != Network.FUSED)
 
@@ -154,7 +165,7 @@ def _draw_estimates(health: Health, record: Record, node: str) -> Figure:
     `record` holds the rows to draw. Forecasts are drawn only if these are all rows of `health`. There are at most as
     many filters as COLOURS.
     """
-    figure, grid = make_stacked_panels(len(record.states), 1.7, 0.8)
+    figure, grid = make_stacked_panels(len(record.states), height=1.7, margin=0.8)
     names = list(record.estimates[node])[: len(COLOURS)]
     record.plot(node, names, axes=grid, sigmas=BAND)
     if record is health.record:
@@ -177,13 +188,15 @@ def run_page(health: Health, network: str, drawings: Mapping[str, bytes]) -> Pag
     """
     instance("health", health, Health, "what examine returns")
     instance("name of the network", network, str, "a text")
-    record, doubts, drawings = health.record, health.warnings(), limit_size_of_drawings(drawings, PAGE)
+    record = health.record
+    doubts = health.warnings()
+    drawings = limit_size_of_drawings(drawings, PAGE)
     rows = f"{len(record.time):,} rows, {_describe_span(record)}"
     glance = [
         _make_key_figures(health, len(doubts)),
         *_list_doubts(doubts),
         *_list_baseline_remarks(health),
-        *_list_filters_of_other_worlds(health),
+        *_list_filters_of_other_models(health),
         *_describe_overloads(record),
     ]
     forecasts = [Section("Forecasts", make_forecast_tables(record, health.forecasts))] if health.forecasts else []
@@ -232,9 +245,9 @@ def limit_size_of_drawings(drawings: Mapping[str, bytes], limit: int) -> dict[st
 
 
 def _make_headline(health: Health) -> str:
-    """Return the title of a run's page: the last estimate of the filter that the network relies on.
+    """Return the title of a run's page: the last estimate by the first filter that the network relies on.
 
-    Its first two states, or its position, with bands where it claims a covariance.
+    It has the first two states, or those of a position, each with a band if the filter claims a covariance.
     """
     record = health.record
     nodes = _choose_nodes_to_draw(record)
@@ -244,6 +257,7 @@ def _make_headline(health: Health) -> str:
     trusted = {filter.filter for filter in health.filters if filter.trusted and filter.node == node}
     name = next((name for name in record.estimates[node] if name in trusted), next(iter(record.estimates[node])))
     estimate = record.estimates[node][name]
+    # Mean and standard deviations of the states in the last row.
     mean = np.asarray(estimate.mean)[-1]
     deviation = np.sqrt(np.maximum(np.diagonal(np.asarray(estimate.covariance)[-1]), 0.0))
     shown_states = find_coordinates(record.states) or tuple(range(min(len(mean), 2)))
@@ -286,7 +300,7 @@ def _list_pictures(health: Health, drawings: Mapping[str, bytes]) -> list[Pictur
 
 
 def make_errors_table(record: Record) -> list[Table]:
-    """Return the table of each filter's errors; none where the recording has no true state."""
+    """Return the table of each filter's errors (RMSE by state, and NEES); [] if the recording has no true states."""
 
     def show(value: float, error: float) -> str:
         """Return a number to the digits of its standard error, or a dash where no truth is known."""
@@ -307,7 +321,7 @@ def make_errors_table(record: Record) -> list[Table]:
 
 
 def _name_with_unit(state: str, units: Mapping[str, str]) -> str:
-    """Return the name of a state, with its unit in brackets where it has one."""
+    """Return the name of a state, with its unit in brackets if it has one."""
     return f"{state} ({units[state]})" if state in units else state
 
 
@@ -345,13 +359,16 @@ def _list_doubts(doubts: list[str]) -> list[Points | Text]:
 
 
 def _list_baseline_remarks(health: Health) -> list[Text | Points]:
-    """Return the doubts about baselines, filters for comparison; they are no doubts about the network."""
+    """Return a text and the doubts about filters that are there for comparison only; [] if there are none.
+
+    They are no doubts about the network, which does not rely on these filters.
+    """
     lines = [visible(line) for line in health.remarks()]
     text = "Of filters that are there to be compared with, on which the network does not rely:"
     return [Text([text]), Points(lines)] if lines else []
 
 
-def _list_filters_of_other_worlds(health: Health) -> list[Text | Points]:
+def _list_filters_of_other_models(health: Health) -> list[Text | Points]:
     """Return a paragraph and a list of filters whose assumed model is not that of their node; [] if there are none."""
     text = "These filters were made for another world than that in which they stand, and claim no more than a number:"
     return [Text([text]), Points([visible(line) for line in health.beliefs])] if health.beliefs else []

@@ -52,7 +52,7 @@ def run_summary(health: Health) -> dict[str, Json]:
 
 
 def _list_refused(health: Health) -> list[Json]:
-    """Return refusals with counts and reasons: values by node, filter and component, and messages by node."""
+    """Return what arrived and was refused, with reasons and counts: values by component, then messages by node."""
     readings: list[Json] = [dict(vars(refusal)) for refusal in health.record.refusals]
     return readings + [
         {"node": node, "reason": reason, "count": count}
@@ -98,7 +98,10 @@ def _list_overload_numbers(probability: np.ndarray, bound: np.ndarray) -> dict[s
 
 
 def _list_link_numbers(link: Arrivals) -> dict[str, Json]:
-    """Return numbers on a component's messages: the share that arrived, the longest gap, and when they are due."""
+    """Return numbers on a component's messages: the share that arrived, the longest gap, and when they are due.
+
+    `period` and `due` are there only if the sender is slower than the rows, or is due in a pattern of rows.
+    """
     numbers: dict[str, Json] = {"arrived": None if link.due is None else link.share, "longest_gap": link.longest_gap}
     if link.period is not None:
         numbers["period"] = link.period

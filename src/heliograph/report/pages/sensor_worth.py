@@ -12,7 +12,7 @@ from heliograph.planning.sensor_worth import SensorWorth
 from heliograph.report.figures import BLUE, GREEN, INK, STYLE, VERMILION, make_stacked_panels
 
 BAR = 0.6  # height of a bar
-NARROW = 4.0  # between the ends of an axis, below which 1, 2, 5, 10, ... would be one tick or two
+NARROW = 4.0  # ratio of an axis's ends below which 1, 2, 5, 10, ... would give only one or two ticks
 SPARE, ROOM = 0.05, 0.2  # share of the axis left free before all bars, and behind them for numbers
 
 
@@ -28,10 +28,10 @@ def draw_worth(worth: SensorWorth, title: str) -> Figure:
         title: how errors were found, in words.
     """
     rows = len(worth.cases)
-    figure, panels = make_stacked_panels(len(worth.states), 0.55 + 0.26 * rows, 0.5)
+    figure, panels = make_stacked_panels(len(worth.states), height=0.55 + 0.26 * rows, margin=0.5)
     figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     units, limits = units_in(worth.states), _find_limits(worth)
-    for panel, i in zip(panels, range(len(worth.states)), strict=True):
+    for i, panel in enumerate(panels):
         _draw_bars_of_state(panel, worth, i, limits)
         state = label_with_unit(str(worth.states[i]), units)
         panel.set_title(f"{state}: with all nodes {worth.complete.error[i]:.3g}")
