@@ -65,7 +65,7 @@ def replay_events(
     smoother = None if lag is None else _LaggedSmoother(timeline, lag)
     # The timeline keeps a bounded number of final rows: they are collected before it would drop any.
     finals: list[Record] = []
-    count = 0
+    count = 0  # of events so far; it stays 0 if there are none
     for count, event in enumerate(in_order, 1):
         if smoother is not None:
             smoother.smooth_until(_arrival_of(event))
@@ -93,7 +93,12 @@ class _LaggedSmoother:
     """
 
     def __init__(self, timeline: Timeline, lag: float):
-        """Keep the timeline, and the lag after which each moment is smoothed; `smoothed` collects the estimates."""
+        """Begin without moments.
+
+        Args:
+            timeline: the timeline that gets the events; `smooth_until` advances its time.
+            lag: how long after each moment its estimates are smoothed, by all events until then.
+        """
         self.smoothed: list[tuple[float, Mapping[str, Mapping[str, Estimate]]]] = []
         self._timeline, self._lag = timeline, lag
         self._waiting: list[float] = []  # a heap of moments whose lag has not passed
@@ -111,7 +116,8 @@ class _LaggedSmoother:
         timeline, smoothed = self._timeline, self.smoothed
         while self._waiting and self._waiting[0] + self._lag < arrival:
             moment = heappop(self._waiting)
-            is_done = bool(smoothed) and smoothed[-1][0] == moment  # two nodes measured at this moment
+            newest_smoothed = smoothed[-1][0] if smoothed else None
+            is_done = newest_smoothed == moment  # two nodes measured at this moment
             is_of_wrong_clock = moment > timeline.now  # the clock's leap in time was taken back since
             if is_done or is_of_wrong_clock:
                 continue

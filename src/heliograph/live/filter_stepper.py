@@ -39,18 +39,24 @@ class NativeFilterStepper:
     """One filter's step by native code, which reads and writes arrays that stay where they are."""
 
     def __init__(self, code: Any, numbers: Leaves, state: Leaves):
-        """Start from the leaves `state`; `code` is what `compile_native_step` returns, `numbers` the filter's arrays.
+        """Name the arrays that the compiled code reads and writes at each call, and set the state.
 
-        The code reads and writes the same arrays at each call. They get names here.
+        The code's arguments are (numbers, state, z, u, k). Its results are (judgement, flagged, state after, estimate,
+        next state), of which the next state, the last, is written over the argument "state".
+
+        Args:
+            code: the compiled step, as `compile_native_step` returns it.
+            numbers: the filter's arrays.
+            state: the leaves (arrays) of the filter's state to start from.
         """
         self._code = code.with_new_memory(numbers)
-        # Arguments are (numbers, state, z, u, k), and results (judgement, flagged, state after, estimate, next state).
-        # A state has n leaves.
-        arguments, results, n = self._code.inputs[len(numbers) :], self._code.outputs, len(state)
+        n = len(state)
+        arguments, results = self._code.inputs[len(numbers) :], self._code.outputs
         self._state, (self._z, self._u, self._k) = arguments[:n], arguments[n:]
         self._judged: Float[np.ndarray, " parts"] = results[0]
-        # The last n results are written over the arguments of the state.
-        self._flagged, self._after, self._estimate = results[1], results[2 : 2 + n], results[2 + n : len(results) - n]
+        self._flagged = results[1]
+        self._after = results[2 : 2 + n]
+        self._estimate = results[2 + n : len(results) - n]
         self.set_state(state)
 
     @property
@@ -84,7 +90,7 @@ class NativeFilterStepper:
         return not self._flagged
 
     def accept(self) -> None:
-        """Accept the state after a step that was flagged."""
+        """Take over the state that the newest step led to, although it was refused (flagged)."""
         self.set_state(self._after)
 
     @property
@@ -97,7 +103,13 @@ class XlaFilterStepper:
     """One filter's step by a program of XLA, with its state."""
 
     def __init__(self, run: Any, numbers: list[jax.Array], state: PyTree):
-        """Start from `state`; `run` is what `compile_xla_step` returns, `numbers` are the filter's arrays."""
+        """Start from a state of the filter.
+
+        Args:
+            run: the compiled step, as `compile_xla_step` returns it.
+            numbers: the filter's arrays.
+            state: the filter's state, a tree of arrays.
+        """
         self._run, self._numbers = run, numbers
         self._state, tree = jax.tree.flatten(state)
         self._tree: Any = tree
@@ -125,8 +137,8 @@ class XlaFilterStepper:
     def step(self, z: np.ndarray, u: np.ndarray, k: int) -> bool:
         """Compute step k from z and u; return whether it was accepted.
 
-        If z or u is implausible or infinite, it is not, and the state stays unchanged. `_run` is the compiled step, and
-        `_tree` the state's structure. `accept` makes the new state the current one.
+        If z or u is implausible or infinite, it is not, and the state stays unchanged (`accept` overrules this). `_run`
+        is the compiled step, `_tree` the state's structure, and `_state` its leaves (arrays).
         """
         with jax.enable_x64(True):
             state = self._tree.unflatten(self._state)
@@ -138,7 +150,7 @@ class XlaFilterStepper:
         return True
 
     def accept(self) -> None:
-        """Accept the state after a step that was flagged."""
+        """Take over the state that the newest step led to, although it was refused (flagged)."""
         self._state = self._after
 
     @property
@@ -162,10 +174,11 @@ def _judge_step(
         u: inputs (inputs,).
         k: step number.
     """
-    filter: AbstractFilter = static.with_arrays(numbers)
+    filter: AbstractFilter = static.with_arrays(numbers)  # the whole filter again
     state_after, estimate, judgement, innovation = filter.judge_step(state, z, u, k)
     # NaN in z means that a component did not arrive. Infinite measurements, and NaN or infinite inputs, are refused.
     has_unusable_numbers = jnp.any(jnp.isinf(z)) | ~jnp.all(jnp.isfinite(u))
+    # The filter's judgement: a reason number above 0 says why z is implausible, and `input` why u is.
     is_refused = has_unusable_numbers | (judgement.reason > 0) | (judgement.input > 0)
     judgement_numbers = jnp.stack(judgement)
     if innovation.weight is not None:
@@ -175,7 +188,10 @@ def _judge_step(
 
 @lru_cache
 def compile_xla_step(static: Static) -> Any:
-    """Return a filter's step, compiled by XLA: `_judge_step` as a function of (numbers, state, z, u, k)."""
+    """Return a filter's step, compiled by XLA: `_judge_step` as a function of (numbers, state, z, u, k).
+
+    `static` is the filter without its arrays. Filters that differ in these alone share the compiled step.
+    """
 
     def step(*data: PyTree) -> PyTree:
         """Return what `_judge_step` returns for the data (numbers, state, z, u, k) of the filter `static`."""
@@ -185,7 +201,7 @@ def compile_xla_step(static: Static) -> Any:
 
 
 def compile_native_step(static: Static, numbers: Sequence[jax.Array], state: PyTree, data: Sequence[np.ndarray]) -> Any:
-    """Return a filter's step as native code, or None if XLA has to step the filter.
+    """Return a filter's step as native code, or None if the native compiler lacks an operation of it.
 
     Its arguments are (numbers, state, z, u, k), flattened. Its results are those of `_judge_step`, and the next state,
     which is written over the argument. The next state is the old one if the step was flagged (refused).
@@ -197,6 +213,7 @@ def compile_native_step(static: Static, numbers: Sequence[jax.Array], state: PyT
         data: z, u and k; only their shapes count.
     """
     leaves, tree = jax.tree.flatten(state)
+    # All that the code depends on, in a form that can be hashed: `_compile_step` remembers what it compiled.
     shapes = tuple((np.shape(leaf), str(leaf.dtype)) for leaf in (*numbers, *leaves, *data))
     return _compile_step(static, shapes, (len(numbers), len(leaves)), tree, read_forced_engine())
 
@@ -270,7 +287,9 @@ class CompiledFilter:
     Attributes:
         horizon: how many steps the filter covers; None for all.
         received, given: how many numbers a measurement and the inputs have.
-        values: how many of the received numbers are values of a sender that decides when to send; 0 if none does.
+        sender: the sender that decides when to send, if the filter can interpret its silence; else None.
+        values: how many of the received numbers are such a sender's values, before its numbers of lost messages; 0
+            without such a sender.
         numbers: the filter's arrays.
         state: structure of its state, to which leaves are put together; `layout`: {path of a leaf: its shape}.
         estimate: structure of the estimate of a step.
@@ -282,22 +301,25 @@ class CompiledFilter:
 
         Filters that differ in numbers alone then share compiled code, which takes the arrays as arguments.
         """
-        # Sizes of z and u, and how many numbers of z are measured values.
         self.filter, self.horizon = filter, filter.horizon
-        self.received, self.given = filter.received, len(filter.inputs)
-        self.values, self.sender = 0, find_deciding_sender(filter)
-        if sender := self.sender:  # behind its values come the numbers of messages lost before each
-            self.values = filter.received - sender.trigger.side_information(sender.outputs)
+        self.received, self.given = filter.received, len(filter.inputs)  # sizes of z and u
+        # Of a sender that decides when to send, z is [measured values, numbers of messages lost before each].
+        self.sender, self.values = find_deciding_sender(filter), 0
+        if sender := self.sender:
+            lost_count = sender.trigger.side_information(sender.outputs)
+            self.values = filter.received - lost_count
         # The filter in double precision, as its arrays and all that is no array; its initial state.
         with jax.enable_x64(True):
             self.numbers, self._static = split_structure(filter)
-            self._start: PyTree = jax.device_put(jax.tree.map(np.asarray, filter.init()))  # no program for each shape
+            # Put on the device as NumPy arrays, since JAX would compile a program for each shape.
+            self._start: PyTree = jax.device_put(jax.tree.map(np.asarray, filter.init()))
         self.state: PyTree = jax.tree.structure(self._start)
         self.layout = {path: part.shape for path, part in split_by_path(self._start).items()}
         self._data = np.zeros(self.received), np.zeros(self.given), np.asarray(0)  # z, u, k: shapes to compile for
+        # The structure of a step's estimate, found from an example whose numbers do not count. `modes` is None, or the
+        # shape of the modes' probabilities, traced without computing anything.
         with jax.enable_x64(True):
             modes = jax.eval_shape(filter.estimate, self._start).modes
-        # An estimate as a step returns it; only its structure counts, so that its numbers stand for any.
         example = JudgedEstimate(
             mean=np.zeros(()),
             covariance=np.zeros(()),
@@ -308,23 +330,27 @@ class CompiledFilter:
             received=0,
         )
         self.estimate: PyTree = jax.tree.structure(example)
-        # The NIS (e' S^-1 e of the innovation) of a filter whose covariance is true is chi-square, with as many degrees
-        # of freedom as numbers arrived. The values that it rarely exceeds, by that number; none if nothing arrived.
+        # If the filter's covariance is true, the NIS (e' S^-1 e of the innovation) is chi-square, with as many degrees
+        # of freedom as numbers arrived. By that number, what it exceeds with probability RARE; inf at 0 numbers.
         self.rare = [np.inf, *(float(chi2.isf(RARE, count)) for count in range(1, self.received + 1))]
 
     def leave_out_refused(
         self, z: Float[np.ndarray, " received"], screened: ScreenedReadings
     ) -> Float[np.ndarray, " received"]:
-        """Return a measurement without the readings that were refused; a sender that decides sent them all the same."""
+        """Return a measurement without the readings that were refused.
+
+        A sender that decides when to send sent a refused reading all the same: its absence must not count as silence,
+        which would tell something of the value.
+        """
         if self.sender is None:
-            return np.asarray(screened.values[0])
+            return np.asarray(screened.values[0])  # of one reading, (1, received)
         return self.sender.trigger.leave_out_refused(z, screened.refused[0] > 0, self.sender.outputs)
 
     def make_stepper(self) -> NativeFilterStepper | XlaFilterStepper:
-        """Return a new stepper whose state is the prior (`_start`).
+        """Return a new stepper of the filter whose state is the initial law (`_start`).
 
-        It uses native code if there is some for the filter, and else XLA. `_static` is the filter without its arrays,
-        and `numbers` are the arrays.
+        It uses native code if the native compiler can compile the filter, and else XLA. `_static` is the filter without
+        its arrays, and `numbers` are the arrays.
         """
         code = compile_native_step(self._static, self.numbers, self._start, self._data)
         if code is None:

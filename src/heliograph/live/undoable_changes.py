@@ -25,7 +25,7 @@ class RowBeforeLeap(NamedTuple):
 
 
 class UndoneLeap(NamedTuple):
-    """What taking back a leap removed from a plant, so that `PlantState.undo_changes` can restore it.
+    """What undoing a leap in time (a clock's error) removed from a plant, so that `undo_changes` can restore it.
 
     Attributes:
         held: all rows held before.

@@ -46,17 +46,26 @@ class RepeatWatch:
 
     @staticmethod
     def for_sensor(sensor: AnySensor | None, channel: Channel | None, received: int) -> "RepeatWatch | None":
-        """Return the watch for what arrives of a sensor; None if its law is not known, or readings arrive changed."""
+        """Return the watch for what arrives of a sensor; None if equal readings say nothing there.
+
+        That is so if no bound is known of how often its noise repeats a reading, or if the channel changes readings.
+
+        Args:
+            sensor: the sensor, with noise that may vary over time; None if it is not known.
+            channel: what its readings pass through; None if it is not known.
+            received: how many numbers arrive.
+        """
         steps = [] if sensor is None else unstack(sensor)
         if channel is None or not steps or not all(isinstance(step, AbstractSensor) for step in steps):
             return None
         if any(len(list_mode_models(step)) > 1 for step in steps):  # of modes, of which one may be that it is stuck
             return None
+        # All outputs have to arrive as they were measured.
         outputs = tuple(range(received))
         if len(steps[0].outputs) != received or not all(delivers_as_sent(link, outputs) for link in unstack(channel)):
             return None
         noises = list({id(step.noise): step.noise for step in steps}.values())
-        try:
+        try:  # whether there is a bound, at any resolution
             for noise in noises:
                 bound_probability_of_equal_readings(noise, np.full(received, inf))
         except ValueError:  # a law of which no bound is known

@@ -31,7 +31,8 @@ def split_by_path(state: PyTree) -> dict[str, np.ndarray]:
 def can_read_layout(old: Shapes, new: Shapes) -> bool:
     """Return whether a state of the layout `old` can be read as one of `new`.
 
-    It can if each part of `new` is in `old` with the same shape, or is a factor of a covariance in `old`.
+    It can if each part of `new` is in `old` with the same shape, or is a factor of a covariance in `old`. A layout has
+    the shape of each part of a state.
 
     A part is known by its path: a stem and an ending such as ".covariance". A covariance's factors have the endings
     LOWER (L below the diagonal, n (n - 1) / 2 numbers) and VARIANCES (D, n numbers).
@@ -83,7 +84,7 @@ class _StatePart:
 
     @property
     def columns(self) -> range:
-        """Return its columns."""
+        """Return the numbers of its columns."""
         return range(self.first, self.end)
 
 
