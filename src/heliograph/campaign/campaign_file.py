@@ -17,8 +17,8 @@ KEEP = ("errors", "trajectories")
 # Names that the store's variables and the table's columns have already.
 VARIABLES = ("error", "variance", "nees_per_dimension", "truth", "measurement", "claim")
 COLUMNS = ("rmse", "rmse_error", "nees_error", "runs", "finite_runs")
-CHUNK = 256
-TIMEOUT = 3600.0  # seconds, compiling included
+CHUNK = 256  # runs that are computed and stored at once, if the file does not say
+TIMEOUT = 3600.0  # seconds, compiling included, if the file does not say
 
 
 def load_campaign(path: str | Path) -> Campaign:
@@ -74,6 +74,8 @@ def read_campaign(text: str, source: str, path: Path) -> Campaign:
             raise fail(f"{name}, key {key!r}", f"one of {', '.join(KEYS)}", f"an unknown key{hint}")
     # Each reader checks its key and raises one line.
     runs, horizon = _read_positive_integer(table, "runs", name), _read_positive_integer(table, "horizon", name)
+    # BLOCK runs are simulated side by side: a chunk has at most all runs, rounded up to a multiple of it.
+    all_runs_rounded_up = BLOCK * math.ceil(runs / BLOCK)
     return Campaign(
         text=text,
         network=_read_network(table, name),
@@ -82,8 +84,7 @@ def read_campaign(text: str, source: str, path: Path) -> Campaign:
         horizon=horizon,
         runs=runs,
         seed=check_seed(f"{name}, seed", table.get("seed", 0)),
-        # At most all runs, rounded up to a multiple of BLOCK.
-        chunk=min(_read_chunk_size(table.get("chunk", CHUNK), name), BLOCK * -(-runs // BLOCK)),
+        chunk=min(_read_chunk_size(table.get("chunk", CHUNK), name), all_runs_rounded_up),
         keep=_read_choice(table.get("keep", KEEP[0]), KEEP, f"{name}, keep"),
         inputs=_read_inputs(table.get("inputs", {}), horizon, name),
         settings=_read_settings(table, name),
@@ -101,7 +102,10 @@ def _parse_toml(text: str, name: str) -> dict[str, object]:
 
 
 def _read_network(table: Mapping[str, object], name: str) -> str:
-    """Return the name of the function that makes the network, as FILE:FUNCTION."""
+    """Return the name of the function that makes the network, as FILE:FUNCTION.
+
+    `table` is the campaign's file, and `name` its name, for errors.
+    """
     value = table.get("network")
     file, _, function = value.rpartition(":") if isinstance(value, str) else ("", "", "")
     if not file.endswith(".py") or not function.isidentifier():
@@ -116,8 +120,8 @@ def _format_value_for_error(value: object) -> str:
 
 
 def _read_positive_integer(table: Mapping[str, object], key: str, name: str) -> int:
-    """Return the value of a key, a whole number from 1."""
-    return check_count(f"{name}, {key}", table.get(key, "none"))
+    """Return the value of a key, a whole number from 1; ValueError names the file (`name`) and the key."""
+    return check_count(f"{name}, {key}", table.get(key, "none"))  # "none" is shown if the key is missing
 
 
 def _read_chunk_size(value: object, name: str) -> int:
@@ -129,7 +133,7 @@ def _read_chunk_size(value: object, name: str) -> int:
 
 
 def _read_timeout(value: object, name: str) -> float:
-    """Return the seconds of a timeout, a positive number."""
+    """Return the seconds of a timeout, a positive number; ValueError names the file, `name`."""
     if not isinstance(value, int | float) or not _is_number(value) or value <= 0:
         raise fail(f"{name}, timeout", "a positive number of seconds", _format_value_for_error(value))
     return float(value)
@@ -143,7 +147,13 @@ def _read_choice(value: object, choices: Sequence[str], name: str) -> str:
 
 
 def _read_inputs(table: object, horizon: int, name: str) -> dict[str, float | list[float]]:
-    """Return the inputs of a campaign's file by name, each a number or one number for each step."""
+    """Return the inputs of a campaign's file by name, each a number or a list with a number for each step.
+
+    Args:
+        table: the value of the key `inputs`.
+        horizon: number of steps.
+        name: name of the file, for errors.
+    """
     if not isinstance(table, dict):
         raise fail(f"{name}, inputs", "a table of numbers by the input's name", repr(table))
     for key, value in table.items():
