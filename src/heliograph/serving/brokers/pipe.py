@@ -132,7 +132,7 @@ class _LineSplitter:
         `ended`: no more bytes will come, so that the last line needs no end.
         """
         if self._newline is None:
-            self._newline = self._find_newline(data)
+            self._newline = self._find_newline(self._rest + data)
         *lines, rest = (self._rest + data).split(self._newline or b"\n")
         if ended:
             lines, rest = [*lines, rest], b""
