@@ -16,7 +16,7 @@ from heliograph.numerics.types import Float
 from heliograph.simulation.network import Network
 
 SAME = 1e-3  # share by which a time step may differ from the difference of two times, which are rounded
-FAR = 1e12  # a mean delay of more is no time
+FAR = 1e12  # a delay of more is no time
 DELAY = "delay"  # the column of a trace: seconds or steps on the way, nan where a message was lost
 
 
@@ -200,7 +200,7 @@ def delay_as_traced(events: Sequence[Event], trace: Path) -> list[Event]:
         trace: a file with a column `delay`, in the unit of time of the events; NaN where a message was lost.
 
     Raises:
-        ValueError: no column `delay`, or a negative one.
+        ValueError: no column `delay`, a negative one, or one of more than 1e12, such as an infinite one.
     """
     events, trace = items("events", events, "events"), file_path("trace", trace)
     # Read the delays, and check them.
@@ -210,6 +210,9 @@ def delay_as_traced(events: Sequence[Event], trace: Path) -> list[Event]:
     delays = np.asarray(columns[DELAY], dtype=float)
     if np.any(delays < 0):
         raise fail(f"trace {trace}, column {DELAY!r}", "no negative number", float(np.nanmin(delays)))
+    if np.any(delays > FAR):  # infinite too: no message could state such an arrival
+        raise fail(f"trace {trace}, column {DELAY!r}", f"at most {FAR:g}; nan where a message was lost",
+                   float(np.nanmax(delays)))  # fmt: skip
     # Messages are delayed or lost, inputs arrive at once.
     sent = [event for event in events if event.node != INPUTS]
     inputs = [event for event in events if event.node == INPUTS]
