@@ -6,11 +6,12 @@ leaves implausible measurements out and goes on, and takes many rows at once.
 
 from collections.abc import Sequence
 from functools import cached_property, lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.stages import Wrapped
 from scipy.stats import chi2
 
 from heliograph.engine.choice import make_native_or_none, read_forced_engine
@@ -29,6 +30,7 @@ from heliograph.numerics.trees.program_text import hash_numbers, write_program_t
 from heliograph.numerics.trees.tree_structure import Static, split_structure
 from heliograph.numerics.types import Float, PyTree
 from straightline import Unsupported, compile_one
+from straightline.compiled import SingleRunCode
 
 Leaves = list[np.ndarray]
 PARTS = len(Judgement._fields)
@@ -38,7 +40,7 @@ RARE = 1e-4  # probability with which an honest filter sees what counts as unexp
 class NativeFilterStepper:
     """One filter's step by native code, which reads and writes arrays that stay where they are."""
 
-    def __init__(self, code: Any, numbers: Leaves, state: Leaves):
+    def __init__(self, code: SingleRunCode, numbers: Leaves, state: Leaves):
         """Name the arrays that the compiled code reads and writes at each call, and set the state.
 
         The code's arguments are (numbers, state, z, u, k). Its results are (judgement, flagged, state after, estimate,
@@ -71,11 +73,11 @@ class NativeFilterStepper:
 
     @property
     def state(self) -> Leaves:
-        """Return copies of the leaves of the filter's state."""
+        """Return copies of the arrays of the filter's state, the leaves of its tree."""
         return [leaf.copy() for leaf in self._state]
 
     def set_state(self, leaves: Sequence[np.ndarray]) -> None:
-        """Set the leaves of the filter's state."""
+        """Set the arrays of the filter's state, given in the order that `state` returns them in."""
         for leaf_of_state, leaf in zip(self._state, leaves, strict=True):
             leaf_of_state[...] = leaf
 
@@ -95,14 +97,14 @@ class NativeFilterStepper:
 
     @property
     def estimate(self) -> Leaves:
-        """Return the leaves of the estimate after the step."""
+        """Return the arrays of the estimate after the newest step, the leaves of its tree."""
         return [leaf.copy() for leaf in self._estimate]
 
 
 class XlaFilterStepper:
     """One filter's step by a program of XLA, with its state."""
 
-    def __init__(self, run: Any, numbers: list[jax.Array], state: PyTree):
+    def __init__(self, run: Wrapped, numbers: list[jax.Array], state: PyTree):
         """Start from a state of the filter.
 
         Args:
@@ -112,7 +114,7 @@ class XlaFilterStepper:
         """
         self._run, self._numbers = run, numbers
         self._state, tree = jax.tree.flatten(state)
-        self._tree: Any = tree
+        self._tree: PyTree = tree
 
     @property
     def judgement(self) -> Float[np.ndarray, " 4"]:
@@ -126,11 +128,11 @@ class XlaFilterStepper:
 
     @property
     def state(self) -> Leaves:
-        """Return the leaves of the filter's state."""
+        """Return the arrays of the filter's state, the leaves of its tree."""
         return [np.asarray(leaf) for leaf in self._state]
 
     def set_state(self, leaves: Sequence[np.ndarray]) -> None:
-        """Set the leaves of the filter's state."""
+        """Set the arrays of the filter's state, given in the order that `state` returns them in."""
         with jax.enable_x64(True):
             self._state = [jnp.array(leaf) for leaf in leaves]
 
@@ -155,7 +157,7 @@ class XlaFilterStepper:
 
     @property
     def estimate(self) -> Leaves:
-        """Return the leaves of the estimate after the step."""
+        """Return the arrays of the estimate after the newest step, the leaves of its tree."""
         return [np.asarray(leaf) for leaf in self._estimate]
 
 
@@ -187,7 +189,7 @@ def _judge_step(
 
 
 @lru_cache
-def compile_xla_step(static: Static) -> Any:
+def compile_xla_step(static: Static) -> Wrapped:
     """Return a filter's step, compiled by XLA: `_judge_step` as a function of (numbers, state, z, u, k).
 
     `static` is the filter without its arrays. Filters that differ in these alone share the compiled step.
@@ -200,7 +202,9 @@ def compile_xla_step(static: Static) -> Any:
     return jax.jit(step, compiler_options=understood())
 
 
-def compile_native_step(static: Static, numbers: Sequence[jax.Array], state: PyTree, data: Sequence[np.ndarray]) -> Any:
+def compile_native_step(
+    static: Static, numbers: Sequence[jax.Array], state: PyTree, data: Sequence[np.ndarray]
+) -> SingleRunCode | None:
     """Return a filter's step as native code, or None if the native compiler lacks an operation of it.
 
     Its arguments are (numbers, state, z, u, k), flattened. Its results are those of `_judge_step`, and the next state,
@@ -220,8 +224,12 @@ def compile_native_step(static: Static, numbers: Sequence[jax.Array], state: PyT
 
 @lru_cache
 def _compile_step(
-    static: Static, shapes: tuple[tuple[tuple[int, ...], str], ...], counts: tuple[int, int], tree: Any, engine: str
-) -> Any:
+    static: Static,
+    shapes: tuple[tuple[tuple[int, ...], str], ...],
+    counts: tuple[int, int],
+    tree: PyTree,
+    engine: str,
+) -> SingleRunCode | None:
     """Return a filter's step as native code (see `compile_native_step`); None if XLA has to step the filter.
 
     A live filter makes one step per message, where native code saves the overhead of JAX. None is returned if the
@@ -255,7 +263,7 @@ def _compile_step(
         next_state = [jnp.where(flagged, old, new) for new, old in zip(after, before, strict=True)]
         return judged, flagged, after, estimate, next_state
 
-    def compile_code() -> Any:
+    def compile_code() -> SingleRunCode:
         """Return the code of the step; the next state is written over the arguments of the state."""
         # {number of a result: number of the argument that it is written over}; -1 is the last result.
         in_place = {i - state_count: number_count + i for i in range(state_count)}
@@ -273,7 +281,10 @@ class DecidingSender(NamedTuple):
 
 
 def find_deciding_sender(filter: AbstractFilter) -> DecidingSender | None:
-    """Return the sender whose silence a filter can interpret, or None if there is none."""
+    """Return the sender whose silence a filter can interpret, or None if there is none.
+
+    Such a sender decides by a trigger when to send: that nothing came says something of its measurement.
+    """
     assumed = filter.assumed  # the plant, sensor, channel and trigger that the filter was made for
     if not filter.silence_tells or assumed is None or assumed.trigger is None:
         return None

@@ -13,7 +13,12 @@ class FinalRows:
     """Outputs of final rows, `size` numbers each, in order of time; beyond `most` rows the oldest parts are dropped."""
 
     def __init__(self, most: int, size: int):
-        """Begin without rows; at least the newest `most` rows are kept, of `size` numbers each."""
+        """Begin without rows.
+
+        Args:
+            most: so many of the newest rows are kept at least.
+            size: how many numbers a row has.
+        """
         self.most, self.size = most, size
         self._parts = deque[tuple[np.ndarray, np.ndarray]]()  # times and outputs of each call of `add`
         self._count = 0  # rows of all parts
@@ -57,9 +62,9 @@ class GateCounts:
             self.counts[name] += int(np.count_nonzero(rows[:, columns] == 0))
 
     def pack(self) -> list[tuple[str, str, int]]:
-        """Return the counts as node, filter and number."""
+        """Return the counts as (node, filter, number), as they are saved."""
         return [(*name, count) for name, count in self.counts.items()]
 
     def unpack(self, stored: Sequence[tuple[str, str, int]]) -> None:
-        """Take counts as `pack` returned them, of the filters that are here."""
+        """Restore counts that `pack` returned; those of filters that are not here any more are left out."""
         self.counts |= {(node, name): count for node, name, count in stored if (node, name) in self.counts}

@@ -7,16 +7,17 @@ from math import ceil, floor, inf, nan
 import numpy as np
 
 from heliograph.live.clock_leap import ARRIVAL, ClockLeap, find_contradicted_leap
-from heliograph.live.event import INPUTS, OF_STEPS, CheckedEvent, Verdict
+from heliograph.live.event import OF_STEPS, CheckedEvent, Verdict
 from heliograph.live.event_screening import EventScreening
 from heliograph.live.fleet_options import Options, check_options
 from heliograph.live.health.link_counts import ScreenedEvent
-from heliograph.live.health.sender_status import SenderStatus, count_values_before_losses, find_silence_rules
+from heliograph.live.health.sender_status import SenderStatus, find_silence_rules
 from heliograph.live.health.stuck_sensor_watch import RepeatWatch
 from heliograph.live.network_step_program import NetworkProgram
 from heliograph.live.plant_state import FinalisedPlant, PlantState
 from heliograph.live.plant_table import StateTable, cut_chain_into_legs, group_by_turn
-from heliograph.live.sorted_rows import BEFORE, HeldRow, SortedRows, list_columns_of_blocks
+from heliograph.live.row_layout import RowLayout
+from heliograph.live.sorted_rows import BEFORE, HeldRow, SortedRows
 from heliograph.model.over_time import steps_covered
 from heliograph.model.readings.repeated_readings import Repeats
 from heliograph.model.readings.timeouts import name_timeout_unit
@@ -39,9 +40,7 @@ class Fleet:
     """
 
     def __init__(self, program: NetworkProgram, options: Options, alone: bool = False):
-        """Start without plants: lay out the numbers of a row, and collect what the network says about its events.
-
-        A row holds what came for one time: the measurements of all nodes, then the plant's inputs, then the time.
+        """Start without plants: collect what the network says about its events, and make the table of states.
 
         Args:
             program: the compiled step of the network.
@@ -54,13 +53,6 @@ class Fleet:
         self.options, self.program = check_options(options), program
         # The filters' states after each row of each plant; a slot is the number of a line of this table.
         self.state_table = StateTable(program, alone)
-        # Layout of a row. sizes: {node: (its index, how many numbers its events have)}; the inputs have index -1.
-        self.sizes = {name: (i, network.nodes[name].received) for i, name in enumerate(network.names)}
-        self.sizes[INPUTS] = -1, self.program.given
-        self._names = [*network.names, INPUTS]
-        # Columns of a row by index of the node, the inputs last; how many numbers a row has before its time.
-        self._columns = list_columns_of_blocks([size for _, size in self.sizes.values()])
-        self.width = self._columns[-1].stop
         # Time: the last step for which the network is defined; whether all events of one time share a row.
         covered = steps_covered(network)
         self.end_step = np.inf if covered is None else covered - 1
@@ -69,11 +61,11 @@ class Fleet:
         self.held_watches = {n: watch for n, node in network.nodes.items() if (watch := RepeatWatch.for_node(node))}
         # Counts: after how many messages a node's running count begins at 0 again, for nodes where it does.
         self.periods = dict[str, int]()
-        # Silence: nodes with a timeout or a trigger; triggers by which senders decide when to send; how many values
-        # such a sender's message has before its numbers of lost messages.
+        # Silence: rules of nodes with a timeout or a trigger; the triggers, by which senders decide when to send.
         self.watched = find_silence_rules(network)
         self.deciding = {name: rule.trigger for name, rule in self.watched.items() if rule.trigger is not None}
-        self._values_before_losses = count_values_before_losses(network, self.deciding)
+        # Where the numbers of events stand in a row; what a node refuses of an event.
+        self.layout = RowLayout(network, program.given, self.deciding)
         self._screening = EventScreening(network, self.deciding, self.held_watches)
         # The slot of plants that have not begun: the initial law, at step -1.
         self._blank = self.state_table.take_slot()
@@ -105,12 +97,12 @@ class Fleet:
         prior_time = -1.0 if by_steps else time
         slot = self.state_table.take_slot()
         self.state_table.write_prior(slot, prior_time)
-        base = HeldRow((prior_time, BEFORE, 0), slot, self.width)
+        base = HeldRow((prior_time, BEFORE, 0), slot, self.layout.width)
         base.numbers[-1] = prior_time  # the last number of a row is its time
         return PlantState(name, self.make_rows(base), now=0.0 if by_steps else time, origin=origin, begun=time)
 
     def end_plant(self, plant: PlantState) -> None:
-        """Remove a plant and free its slots."""
+        """Free the slots of a plant, its lines in the table; it must not be used any more."""
         self.end_silence(plant)
         self.state_table.free_slots(plant.slots)
 
@@ -126,7 +118,7 @@ class Fleet:
             if step <= before.key[0]:  # the plant was already predicted so far
                 continue
             slot = plant.silence.slot if plant.silence is not None else self.state_table.take_slot()
-            plant.silence = HeldRow((step, 0, 0), slot, self.width)  # nothing came: all its numbers are NaN
+            plant.silence = HeldRow((step, 0, 0), slot, self.layout.width)  # nothing came: all its numbers are NaN
             self.state_table.table[slot, self.state_table.numbers] = plant.silence.numbers
             chains.append([before, plant.silence])
         self._step_chains(chains)
@@ -137,14 +129,9 @@ class Fleet:
             self.state_table.free_slots([plant.silence.slot])
             plant.silence = None
 
-    def count_values(self, node: int) -> int:
-        """Return how many numbers an event has of the node with this index, -1 for the inputs."""
-        columns = self._columns[node]  # the inputs' columns are the last, so that -1 finds them
-        return int(columns.stop - columns.start)
-
     def make_rows(self, base: HeldRow) -> SortedRows:
         """Return the history of a plant before its first event: only the row `base`, with the initial law."""
-        return SortedRows(base, self._joint, self._columns, self.options.capacity)
+        return SortedRows(base, self._joint, self.layout.columns, self.options.capacity)
 
     def convert_message(
         self, node: str, sequence: int, time: float, values: list[float | None], arrival: float
@@ -153,55 +140,14 @@ class Fleet:
 
         None stands for a value that did not arrive. `time` and `arrival` are in steps, or in the unit of dt.
         """
-        index, size = self.sizes.get(node, (0, -1))
+        index, size = self.layout.sizes.get(node, (0, -1))
         if size < 0:  # no such node
-            raise fail("message, node", f"one of {', '.join(self.sizes)}", repr(node)[:60])
-        numbers = self.append_losses(node, [nan if value is None else value for value in values])
+            raise fail("message, node", f"one of {', '.join(self.layout.sizes)}", repr(node)[:60])
+        numbers = self.layout.append_losses(node, [nan if value is None else value for value in values])
         if len(numbers) != size:
             raise fail(f"message of {node!r}, values", f"{size} numbers", len(values))
         self.check_step("message, time", time)
         return CheckedEvent(index, sequence, time, numbers, arrival)
-
-    def append_losses(self, node: str, values: list[float]) -> list[float]:
-        """Return a message's values, followed by NaN for each number of lost messages if it does not state these.
-
-        A filter of a sender that decides when to send needs to know how many messages were lost before each one: its
-        messages are [measured values, numbers of lost messages]. A sender need not state the numbers, since they follow
-        from its running count of messages, which later replaces the NaN. Other nodes' values are returned as they are.
-
-        Raises:
-            ValueError: values of a sender of single components, whose losses a count of messages does not say.
-        """
-        _, size = self.sizes[node]
-        outputs = self.count_values_alone(node)
-        if outputs is None:
-            return values
-        if len(values) == outputs:
-            values = values + [nan] * (size - outputs)
-        # Such a sender decides for each component by itself (region "each") and has to state the number of losses of
-        # each one that arrived. x == x holds unless x is NaN.
-        is_by_component = self.deciding[node].region == "each" and len(values) == size
-        lacks_number = is_by_component and any(
-            value == value and lost != lost for value, lost in zip(values[:outputs], values[outputs:], strict=True)
-        )
-        if lacks_number:
-            expected = "behind each value how many of its component were lost since the last"
-            raise fail(
-                f"message of {node!r}, values", expected, "none, and its count is of messages, not of components"
-            )
-        return values
-
-    def count_values_alone(self, node: str) -> int | None:
-        """Return how many values a node's event has without numbers of lost messages; None if it has none of these."""
-        return self._values_before_losses.get(self.sizes[node][0])
-
-    def _find_lost_column(self, node: int) -> tuple[str, int] | None:
-        """Return the node's name and the column of its number of lost messages, or None if it has no such number."""
-        outputs = self._values_before_losses.get(node)
-        # With one number behind the values, all of a message is lost or none; with several, each component by itself.
-        if outputs is None or self.count_values(node) != outputs + 1:
-            return None
-        return self._names[node], self._columns[node].start + outputs
 
     def check_step(self, name: str, time: float) -> None:
         """Raise ValueError if the network counts steps and `time` is none of them; the error calls it `name`."""
@@ -241,14 +187,14 @@ class Fleet:
         # The clock by which it is now: that of arrivals where one was given, else the sender's.
         longest_gap = self.options.leap
         clock_time = event.arrival if arrival_known else event.time
-        clock_name = ARRIVAL if arrival_known else clock or self._names[event.node_index]
+        clock_name = ARRIVAL if arrival_known else clock or self.layout.names[event.node_index]
         # A second clock may agree: the receiver's own, or the sender's with that of arrivals.
         wall_agrees = wall is not None and abs(clock_time - wall) <= longest_gap
         sender_agrees = arrival_known and abs(clock_time - event.time) <= longest_gap
         agreed = wall_agrees or sender_agrees
         # The event may show that an earlier leap never happened, unless it will be refused as dated in the future.
         if plant.leap is not None and event.time <= event.arrival + self.options.ahead:
-            plant.undo_contradicted_leap(clock_name, clock_time, longest_gap, agreed, self._names)
+            plant.undo_contradicted_leap(clock_name, clock_time, longest_gap, agreed, self.layout.names)
             if not arrival_known:  # it arrives now, and undoing the leap may have set that time back
                 event = event._replace(arrival=max(plant.confirmed, event.time))
         now = max(plant.confirmed, event.arrival)
@@ -256,8 +202,8 @@ class Fleet:
         verdict = plant.rows.judge_event(event, key, now - self.options.window, self.options.ahead)
         if verdict == "used":
             self.end_silence(plant)
-            lost_column = self._find_lost_column(event.node_index)
-            plant.add_event(event, key, self.state_table.take_slot, self.width, lost_column)
+            lost_column = self.layout.find_lost_column(event.node_index)
+            plant.add_event(event, key, self.state_table.take_slot, self.layout.width, lost_column)
             plant.pass_time(clock_name, clock_time, now, longest_gap, agreed)
         return verdict
 
@@ -272,7 +218,7 @@ class Fleet:
             found = find_contradicted_leap(leap, plant.now, now, longest_gap)
             contradicted = None if found is None else found[0]  # a leap; found[1] is the newest arrival after it
             if contradicted is not None and contradicted.now > -inf:  # -inf: the plant began with it, nothing is before
-                plant.undo_leap(contradicted, longest_gap, self._names)
+                plant.undo_leap(contradicted, longest_gap, self.layout.names)
             elif now >= leap.time - longest_gap:  # the right time has come as far, and confirms the leap
                 plant.leap = None
         plant.now = max(plant.now, now)
@@ -341,7 +287,7 @@ class Fleet:
 
     def predict_into(self, row: HeldRow, time: float, slot: int) -> None:
         """Write the prediction from a row to a later time, without measurements, into a slot that no row has."""
-        self.step_row(row, HeldRow((float(time), 0, 0), slot, self.width))
+        self.step_row(row, HeldRow((float(time), 0, 0), slot, self.layout.width))
 
     def predict_outputs(
         self, plants: Sequence[PlantState | None], given: Float[np.ndarray, "plant given"]
@@ -355,7 +301,10 @@ class Fleet:
         return self.state_table.predict_outputs(np.array(slots), given, self.end_step)
 
     def outputs(self, slots: list[int]) -> Float[np.ndarray, "row outputs"]:
-        """Return the outputs of all filters (row, output) after the rows in these slots of the table."""
+        """Return the outputs of all filters, their estimates and judgements, after rows; (row, output).
+
+        `slots`: the lines of the rows in the table.
+        """
         return self.state_table.table[np.array(slots, dtype=int), self.state_table.outputs]
 
     def find_sender_status(self, plant: PlantState, now: float = -inf) -> dict[str, SenderStatus]:

@@ -149,9 +149,9 @@ def _pass_silent_steps(
 def _restore_factors(
     state: Float[np.ndarray, " state"], factors: Sequence[FactorIndices]
 ) -> Float[np.ndarray, " state"]:
-    """Return one state with factors in place of covariances."""
-    alone: Float[np.ndarray, " state"] = convert_to_factors(state[None], factors)[0]
-    return alone
+    """Return one state with factors L and D in place of covariances L D L'."""
+    with_factors: Float[np.ndarray, " state"] = convert_to_factors(state[None], factors)[0]  # of several, here of one
+    return with_factors
 
 
 def _extrapolate_state(passed: Sequence[Float[np.ndarray, " state"]], count: int) -> Float[np.ndarray, " state"]:
@@ -177,8 +177,8 @@ def _step_through(step: Step, state: Float[np.ndarray, " state"], at: int, count
     states = state[None]
     for k in range(at + 1, at + count + 1):
         states = step(states, k)
-    walked: Float[np.ndarray, " state"] = states[0].copy()
-    return walked
+    stepped: Float[np.ndarray, " state"] = states[0].copy()
+    return stepped
 
 
 def _find_moving(before: Float[np.ndarray, " state"], after: Float[np.ndarray, " state"]) -> np.ndarray:

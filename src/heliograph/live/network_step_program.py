@@ -79,7 +79,7 @@ class NetworkProgram:
 
     @cached_property
     def identity(self) -> Identity:
-        """Return the identity of the network and its program, which a saved timeline is compared with."""
+        """Return versions, names and hashes of numbers of the network, by which a saved timeline is recognised."""
         return network_identity(self.network, self.step_rows.program, {})
 
 

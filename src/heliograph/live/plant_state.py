@@ -14,7 +14,7 @@ from heliograph.live.clock_leap import ARRIVAL, ClockLeap, find_contradicted_lea
 from heliograph.live.event import INPUTS, CheckedEvent
 from heliograph.live.health.link_counts import LinkCounts
 from heliograph.live.sorted_rows import HeldRow, Key, SortedRows
-from heliograph.live.undoable_changes import Change, RowBeforeLeap, UndoneLeap, WithdrawnEvent
+from heliograph.live.undoable_changes import Change, RowBeforeLeap, RowContent, UndoneLeap, WithdrawnEvent
 
 
 @dataclass
@@ -161,8 +161,8 @@ class PlantState:
         held = self.rows.held
         first_after = self.rows.first_from(leap.time - longest_gap)  # index of the first row of the leap
         # If all rows held are of the leap, only the row kept from before it is left.
-        all_after = first_after == 0
-        if all_after and self.row_before_leap is None:
+        all_after, row_before_leap = first_after == 0, self.row_before_leap
+        if all_after and row_before_leap is None:
             return False
         # The first row held is the base, whose events are final: they stay counted as used.
         not_final = held[max(first_after, 1) :]
@@ -172,14 +172,14 @@ class PlantState:
         self.undone_leaps.append(
             UndoneLeap(
                 held=held,
-                row_before_leap=self.row_before_leap,
+                row_before_leap=row_before_leap,
                 changes=len(self.changes),
                 removed_rows=removed_rows,
                 rows=not_final,
             )
         )
-        if all_after and self.row_before_leap is not None:
-            self.rows.replace_rows([self.row_before_leap.row])  # the base again
+        if all_after and row_before_leap is not None:
+            self.rows.replace_rows([row_before_leap.row])  # later rows are stepped from it again
             self.row_before_leap = None
         else:
             self.rows.replace_rows(held[:first_after])
@@ -240,9 +240,9 @@ class PlantState:
             row = HeldRow(key, take_slot(), width)
             self.rows.keys.insert(index, key)
             self.rows.held.insert(index, row)
-            change: Change = row, None  # the row is new
+            change = Change(row, before=None)
         else:
-            change = row, (row.numbers.copy(), dict(row.events))  # what it had before
+            change = Change(row, before=RowContent(row.numbers.copy(), dict(row.events)))
         self.rows.write_event(row, event)
         if losses is not None:
             node, column = losses
@@ -269,7 +269,7 @@ class PlantState:
         newest_count = self.links[node].newest if node in self.links else -1
         row.numbers[column], corrected = self.rows.count_lost(index, event, column, newest_count)
         for later_row, number in corrected:
-            self.changes.append((later_row, (later_row.numbers.copy(), dict(later_row.events))))
+            self.changes.append(Change(later_row, RowContent(later_row.numbers.copy(), dict(later_row.events))))
             later_row.numbers[column] = number
 
     def undo_changes(self) -> list[int]:
@@ -294,17 +294,14 @@ class PlantState:
         return freed
 
     def _undo_since(self, count: int) -> list[int]:
-        """Undo the changes after the first `count`, newest first; return the slots that are free again.
-
-        A change is a pair of a row, and its numbers and events before; these are None if the row was new.
-        """
+        """Undo the changes after the first `count`, newest first; return the slots that are free again."""
         slots = []
         for row, before in reversed(self.changes[count:]):
             if before is None:  # the row was new
                 self.rows.remove_row(self.rows.find_index(row.key))
                 slots.append(row.slot)
             else:
-                row.numbers, row.events = before
+                row.numbers, row.events = before.numbers, before.events
         del self.changes[count:]
         return slots
 
@@ -352,10 +349,9 @@ class PlantState:
         # The oldest leap that may be undone. That with which the plant began has no row before it.
         leaps = [] if self.leap is None else [leap for leap in self.leap.list_with_earlier() if leap.now > -inf]
         leap = leaps[-1] if leaps else None
-        if self.row_before_leap is not None and (
-            leap is None or leap.now != self.row_before_leap.now
-        ):  # it was of another leap
-            left, self.row_before_leap = [*left, self.row_before_leap.row], None
+        kept = self.row_before_leap
+        if kept is not None and (leap is None or leap.now != kept.now):  # it was kept for another leap
+            left, self.row_before_leap = [*left, kept.row], None
         if leap is not None and self.row_before_leap is None:
             far_side = leap.time - longest_gap  # rows from then on are after the leap
             rows_before_leap = [row for row in left if row.key[0] < far_side]

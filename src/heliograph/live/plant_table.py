@@ -19,8 +19,9 @@ SHORTEST = 64  # rows of a history
 class StateTable:
     """Table of states: a slot is a row of it, which is taken and given back.
 
-    The columns are (state, outputs, inputs held, step number, received, inputs, time); `state`, `outputs`, `held` and
-    `at` are the slices of the first four, `numbers` that of the last three, which a `HeldRow` has as well.
+    The columns are (state, outputs, inputs held, step number, received, inputs, time); `state`, `outputs`,
+    `held_inputs` and `step_number` are the slices of the first four, `numbers` that of the last three, which a
+    `HeldRow` has as well.
     `alone`: single rows are stepped, not many at once.
     """
 
@@ -28,7 +29,7 @@ class StateTable:
         """Make a table with FEWEST free slots for rows of a network's program.
 
         These slices of a row's columns follow one another: `state` (of the filters), `outputs` (their estimates),
-        `held` (inputs that hold after the row), `at` (step number), and `numbers` (what came: measurements, inputs,
+        `held_inputs` (inputs that hold after the row), `step_number`, and `numbers` (what came: measurements, inputs,
         and time as the last).
 
         Args:
@@ -44,7 +45,7 @@ class StateTable:
             program.received + program.given + 1,
         ]
         ends = np.cumsum(sizes)
-        self.state, self.outputs, self.held, self.at, self.numbers = (
+        self.state, self.outputs, self.held_inputs, self.step_number, self.numbers = (
             slice(int(end) - size, int(end)) for size, end in zip(sizes, ends, strict=True)
         )
         self.table = np.zeros((FEWEST, int(ends[-1])))
@@ -57,7 +58,7 @@ class StateTable:
 
     @property
     def used(self) -> int:
-        """Return how many slots are taken."""
+        """Return how many slots (lines of the table) are taken."""
         return len(self.table) - len(self._free)
 
     def take_slot(self) -> int:
@@ -82,7 +83,7 @@ class StateTable:
         row = self.table[slot]
         row[:] = 0.0
         step_before_all = -1.0
-        row[self.state], row[self.at], row[self.numbers] = self.step_rows.start, step_before_all, np.nan
+        row[self.state], row[self.step_number], row[self.numbers] = self.step_rows.start, step_before_all, np.nan
         row[-1] = time
 
     def predict_outputs(self, before: np.ndarray, given: np.ndarray, last: float) -> np.ndarray:
@@ -96,10 +97,10 @@ class StateTable:
             last: the last step for which the network is defined: the step number is at most this.
         """
         dt, table = self.program.dt, self.table
-        u = np.where(np.isnan(given), table[before, self.held], given)  # held: the inputs that hold after a row
+        u = np.where(np.isnan(given), table[before, self.held_inputs], given)
         if dt is not None:
             u = _insert_time_step(u, dt, np.ones(len(u)))
-        k = np.minimum(table[before, self.at.start] + 1, last)
+        k = np.minimum(table[before, self.step_number.start] + 1, last)
         nothing = np.full((len(before), self.program.received), np.nan)
         state_and_outputs = self._step_parts(table[before, self.state], nothing, u, k[:, None])
         return state_and_outputs[:, self.step_rows.state.size :].copy()
@@ -111,7 +112,7 @@ class StateTable:
         received at the last of these. `at` are the numbers of these steps; in continuous time they are not used.
         """
         dt, table = self.program.dt, self.table
-        numbers, held = table[after, self.numbers], table[before, self.held]
+        numbers, held = table[after, self.numbers], table[before, self.held_inputs]
         # The numbers of a row are [measurements, inputs, time]. An input that did not come keeps its value.
         received, given = numbers[:, : self.program.received], numbers[:, self.program.received : -1]
         now_held = np.where(np.isnan(given), held, given)
@@ -123,10 +124,10 @@ class StateTable:
         else:
             # Inputs given with a row hold from there on: those of before led to it.
             u = _insert_time_step(held, dt, numbers[:, -1] - table[before, -1])
-            k = table[before, self.at.start] + 1
+            k = table[before, self.step_number.start] + 1
         state_and_outputs = self._step_parts(table[before, self.state], received, u, k[:, None])
         table[after, : self.outputs.stop] = state_and_outputs
-        table[after, self.held], table[after, self.at.start] = now_held, k
+        table[after, self.held_inputs], table[after, self.step_number.start] = now_held, k
 
     def _step_parts(self, *parts: np.ndarray) -> np.ndarray:
         """Step rows, and return their new states and outputs in one array (row, state + outputs).
@@ -146,12 +147,12 @@ class StateTable:
         between both rows.
         """
         dt, table = self.program.dt, self.table
-        step_number = int(table[after, self.at.start])
+        step_number = int(table[after, self.step_number.start])
         if dt is None:
-            return table[after, self.held], step_number
+            return table[after, self.held_inputs], step_number
         time_column = self.numbers.stop - 1
         time_between = table[[after], time_column] - table[[before], time_column]
-        u_without_dt = table[before, self.held]
+        u_without_dt = table[before, self.held_inputs]
         return _insert_time_step(u_without_dt[None], dt, time_between)[0], step_number
 
     def pass_long_gap(self, slot: int, to: int) -> None:
@@ -160,7 +161,7 @@ class StateTable:
         The work is bounded, however long the gap (`heliograph.live.long_gap`).
         """
         row = self.table[slot]
-        step_before, inputs = int(row[self.at.start]), row[self.held]
+        step_before, inputs = int(row[self.step_number.start]), row[self.held_inputs]
         nothing = np.full(self.program.received, np.nan)
 
         def step(states: Float[np.ndarray, "row state"], k: int) -> Float[np.ndarray, "row state"]:
@@ -177,7 +178,7 @@ class StateTable:
         state_after = pass_long_gap(
             step, self.step_rows.start, state_before, at=step_before, count=to - step_before, factors=factors
         )
-        self.table[slot, self.state], self.table[slot, self.at.start] = state_after, to
+        self.table[slot, self.state], self.table[slot, self.step_number.start] = state_after, to
 
     def gather_history(self, slots: Sequence[int]) -> PyTree:
         """Return the rows in these slots (lines of the table), in order, as a smoother takes them.
@@ -187,8 +188,13 @@ class StateTable:
         """
         length = max(SHORTEST, 1 << (len(slots) - 1).bit_length())  # the next power of two
         rows = self.table[[*slots, *[slots[-1]] * (length - len(slots))]]
-        state, outputs = rows[:, self.state], rows[:, self.outputs]
-        return self.step_rows.history(rows[:, self.numbers], state, rows[:, self.held], rows[:, self.at.start], outputs)
+        return self.step_rows.history(
+            rows[:, self.numbers],
+            rows[:, self.state],
+            rows[:, self.held_inputs],
+            rows[:, self.step_number.start],
+            rows[:, self.outputs],
+        )
 
 
 def _insert_time_step(u: Float[np.ndarray, "row given"], dt: int, steps: Float[np.ndarray, " row"]) -> np.ndarray:

@@ -247,23 +247,24 @@ class Stream:
         judgement = Judgement(*stepper.judgement.tolist())
         if len(u) and (why := Judgement.why_inputs(stepper.judgement[None])):
             check_inputs(self.filter.inputs, u[None], self.filter, self.steps)
-            # Try inputs of zero without a measurement, and take the step back.
-            state = stepper.state
-            stepper.step(np.full(len(z), np.nan), np.zeros(len(u)), self.steps)
-            why_zeros = Judgement.why_inputs(stepper.judgement[None])
-            stepper.set_state(state)
-            if not why_zeros:
-                raise fail(
-                    f"inputs of step {self.steps}",
-                    "plausible ones",
-                    f"{u.tolist()}: {why}{self._name_faulty_function(u)}",
-                )
+            if self._are_zero_inputs_plausible():
+                got = f"{u.tolist()}: {why}{self._name_faulty_function(u)}"
+                raise fail(f"inputs of step {self.steps}", "plausible ones", got)
         if judgement.reason > 0:
             why = Judgement.describe(float(judgement.reason), float(judgement.distance)) + self._name_faulty_function(u)
             raise fail(f"measurement of step {self.steps}", "a plausible one", f"{z.tolist()}: {why}")
         # Step anew, since zeros may have been tried in between, and accept.
         stepper.step(z, u, self.steps)
         stepper.accept()
+
+    def _are_zero_inputs_plausible(self) -> bool:
+        """Return whether inputs of zero, without a measurement, are plausible in this step; the state stays."""
+        stepper = self._stepper
+        state_before = stepper.state
+        stepper.step(np.full(self.filter.received, np.nan), np.zeros(len(self.filter.inputs)), self.steps)
+        why_implausible = Judgement.why_inputs(stepper.judgement[None])
+        stepper.set_state(state_before)
+        return not why_implausible
 
     def _name_faulty_function(self, u: np.ndarray) -> str:
         """Return "; " and the function of the filter's model that is not finite for inputs u, or "" if none is."""

@@ -147,7 +147,7 @@ class Timeline:
         links = self._plant.links
         return {
             name: {verdict: getattr(links.get(name, LinkCounts()), verdict) for verdict in VERDICTS}
-            for name in self._fleet.sizes
+            for name in self._fleet.layout.sizes
         }
 
     @property
@@ -362,15 +362,15 @@ class Timeline:
         self, node: str, sequence: int, time: float, values: ArrayLike, arrival: float | None
     ) -> CheckedEvent:
         """Return a pushed event as checked numbers; without `arrival` it arrived when measured, or now if later."""
-        sizes, name = self._fleet.sizes, f"event of {node!r}"
+        sizes, name = self._fleet.layout.sizes, f"event of {node!r}"
         if not isinstance(node, str) or node not in sizes:
             raise fail("node of an event", f"one of {', '.join(sizes)}", show_value(node))
         index, size = sizes[node]
         moment = check_moment(f"{name}, time", time)
         self._fleet.check_step(f"{name}, time", moment)
         arrived = max(self._plant.confirmed, moment) if arrival is None else check_moment(f"{name}, arrival", arrival)
-        numbers = check_numbers(name, values, size, self._fleet.count_values_alone(node)).tolist()
-        numbers = self._fleet.append_losses(node, numbers)
+        numbers = check_numbers(name, values, size, self._fleet.layout.count_values_alone(node)).tolist()
+        numbers = self._fleet.layout.append_losses(node, numbers)
         return CheckedEvent(index, check_63_bits(f"{name}, sequence", sequence), moment, numbers, arrived)
 
     def _finalise(self) -> None:

@@ -44,7 +44,8 @@ class RemarkWatch:
     def _read_remarks(self, row: HeldRow) -> dict[tuple[str, str], Any]:
         """Return the remark of each filter on its state after a row, by node and filter.
 
-        Filters that can never make a remark have none; `counts` has the others.
+        A remark has `words`, and `times`: how often it was made. Filters that can never make one have none; `counts`
+        has the others.
         """
         if not self.counts:
             return {}

@@ -1,6 +1,6 @@
 """Plausibility of the events of a batch: an event is implausible if no filter of its node could use it."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from math import nan
 from typing import NamedTuple
 
@@ -96,22 +96,9 @@ class JudgementReader:
         reasons = {i: why for i in flagged if (why := self._explain_event(taken[i]))}
         # Of several nodes' events that were judged together only the one to blame stays in `reasons`.
         self._drop_blameless(taken, reasons)
-        # By row and node, the index of the event with the largest number.
-        largest: dict[tuple[int, int], int] = {}
-        for i in reasons:
-            node_of_row = taken[i].row.slot, taken[i].event.node_index
-            largest[node_of_row] = max(
-                largest.get(node_of_row, i), i, key=lambda j: _find_largest_number(taken[j].event)
-            )
-        # By plant, the index of its first implausible inputs. Later events were judged with them, and may be all right
-        # without them.
-        first_inputs: dict[str, int] = {}
-        for i in reasons:
-            if taken[i].event.is_inputs:
-                first = first_inputs.setdefault(taken[i].plant.name, i)
-                first_inputs[taken[i].plant.name] = min(first, i, key=lambda j: taken[j].row.key)
         # The largest event of its node in its row; but of a plant with implausible inputs only the first of these.
-        to_refuse = [i for i in reasons if i in largest.values() and first_inputs.get(taken[i].plant.name, i) == i]
+        largest, first_inputs = _find_largest_events(taken, reasons), _find_first_inputs(taken, reasons)
+        to_refuse = [i for i in reasons if i in largest and first_inputs.get(taken[i].plant.name, i) == i]
         return {i: reasons[i] + self._name_faulty_function(taken[i]) for i in to_refuse}
 
     def _find_flagged(self, taken: Sequence[CandidateEvent]) -> list[int]:
@@ -208,7 +195,7 @@ class JudgementReader:
         # Copy the row to a slot of its own, with NaN for the node's numbers.
         event, row = candidate.event, candidate.row
         state_table, rows = self.fleet.state_table, candidate.plant.rows
-        trial = HeldRow(row.key, state_table.take_slot(), self.fleet.width)
+        trial = HeldRow(row.key, state_table.take_slot(), self.fleet.layout.width)
         trial.numbers = row.numbers.copy()
         columns = rows.columns_by_node[event.node_index]
         trial.numbers[columns] = [nan] * (columns.stop - columns.start)
@@ -218,6 +205,26 @@ class JudgementReader:
         judgements = outputs[self._judgement_columns[event.node_index]]
         state_table.free_slots([trial.slot])
         return Judgement.why_values(judgements) is None
+
+
+def _find_largest_events(taken: Sequence[CandidateEvent], indices: Iterable[int]) -> set[int]:
+    """Return, of the candidates with these indices, those of the event with the largest number of its node and row."""
+    largest: dict[tuple[int, int], int] = {}  # {(row, node): index of the event with the largest number so far}
+    for i in indices:
+        row_and_node = taken[i].row.slot, taken[i].event.node_index
+        before = largest.get(row_and_node, i)
+        largest[row_and_node] = max(before, i, key=lambda j: _find_largest_number(taken[j].event))
+    return set(largest.values())
+
+
+def _find_first_inputs(taken: Sequence[CandidateEvent], indices: Iterable[int]) -> dict[str, int]:
+    """Return {plant: which of the candidates with these indices has its first inputs}, of plants with inputs there."""
+    first_inputs: dict[str, int] = {}
+    for i in indices:
+        if taken[i].event.is_inputs:
+            first = first_inputs.setdefault(taken[i].plant.name, i)
+            first_inputs[taken[i].plant.name] = min(first, i, key=lambda j: taken[j].row.key)  # by time first
+    return first_inputs
 
 
 def _find_largest_number(event: CheckedEvent) -> float:

@@ -30,7 +30,7 @@ class ScreenedEvent(NamedTuple):
 
     @property
     def is_empty(self) -> bool:
-        """Whether values were removed and none is left."""
+        """Return whether values were removed and none is left."""
         return bool(self.why) and all(value != value for value in self.event.values)
 
 
@@ -94,7 +94,7 @@ class LinkCounts:
 
     @property
     def held(self) -> int:
-        """Return how many runs of equal readings were longer than noise allows, of a node that refuses none."""
+        """Return how many runs of equal readings were longer than the sensor's noise allows, over all components."""
         return sum(self.repeats.found)
 
     def count_timeout(self, time: float, begun: float, timeout: float) -> None:
@@ -115,7 +115,7 @@ class LinkCounts:
         self._follow_sequence(verdict, sequence, time, period)
 
     def count_verdict(self, verdict: Verdict) -> None:
-        """Count one verdict alone, as of inputs beside a measurement, whose running count is the measurement's."""
+        """Count one verdict, but do not follow a running count, as for inputs that share a measurement's message."""
         # Each verdict has a count of the same name.
         setattr(self, verdict, getattr(self, verdict) + 1)
 

@@ -104,7 +104,10 @@ class _ColumnCounter:
         return columns
 
     def note_part(self, filter_name: str, path: str, columns: np.ndarray) -> None:
-        """Note the columns of a filter's part, which stand side by side; `columns` has the part's shape."""
+        """Note in `filters` where a part of a filter's state stands: [its shape, first column, end of its columns].
+
+        `columns` has the column of each number of the part, in its shape; they stand side by side.
+        """
         first = int(columns.flat[0]) if columns.size else 0
         self.filters.setdefault(filter_name, {})[path] = [list(columns.shape), first, first + columns.size]
 
@@ -180,7 +183,10 @@ class PlantMigration:
             self._say(f"{what}: {line}")
 
     def _has_counterpart(self, name: str, new: Mapping[str, Mapping[str, Sequence[Any]]]) -> bool:
-        """Return whether the stored state of the filter of this name can be read as its state now."""
+        """Return whether the stored state of the filter of this name can be read as its state now.
+
+        `new`: by filter and path of a part of its state now [shape, first column, end].
+        """
         shapes_before = {path: shape for path, (shape, _, _) in self._old["filters"].get(name, {}).items()}
         shapes_now = {path: shape for path, (shape, _, _) in new.get(name, {}).items()}
         return can_read_layout(shapes_before, shapes_now)
@@ -304,7 +310,8 @@ class PlantMigration:
         held = old["state"] + old["outputs"]
         step = held + old["given"]
         measured = step + 1
-        translated[:, state_table.held], translated[:, state_table.at] = table[:, held:step], table[:, step:measured]
+        translated[:, state_table.held_inputs] = table[:, held:step]
+        translated[:, state_table.step_number] = table[:, step:measured]
         translated[:, state_table.numbers] = self._translate_numbers(table[:, measured:], index_here)
         return translated
 

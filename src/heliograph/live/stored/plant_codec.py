@@ -180,7 +180,7 @@ def _make_rows_with_events(parts: PlantParts, fleet: Fleet) -> list[HeldRow]:
     # The values of all events follow one another; each has as many as its node sends.
     begin = 0
     for time, (i, node, sequence) in zip(parts.times.tolist(), parts.events.tolist(), strict=True):
-        end = begin + fleet.count_values(node)
+        end = begin + fleet.layout.count_values(node)
         rows[i].events[node, sequence, time] = parts.values[begin:end].tolist()
         begin = end
     return rows
@@ -210,6 +210,6 @@ def _make_held_row(fleet: Fleet, numbers: np.ndarray, node: int, sequence: int) 
     """Return a row with the key (time, node, sequence), whose numbers stand in a new slot of the fleet's table."""
     slot = fleet.state_table.take_slot()
     fleet.state_table.table[slot] = numbers
-    row = HeldRow((float(numbers[-1]), node, sequence), slot, fleet.width)
+    row = HeldRow((float(numbers[-1]), node, sequence), slot, fleet.layout.width)
     row.numbers = numbers[fleet.state_table.numbers].tolist()
     return row
