@@ -181,21 +181,32 @@ def _read_settings(table: Mapping[str, object], name: str) -> list[Setting]:
     if ("grid" in table) == ("settings" in table):
         raise fail(f"campaign {name}", "either [grid] or [[settings]]", "both" if "grid" in table else "neither")
     settings = _expand_grid(table["grid"], name) if "grid" in table else _read_listed_settings(table["settings"], name)
-    # Parameters become coordinates of the store: their names must be free there, their values plain.
+    _check_parameters(settings, name)
+    _check_distinct(settings, name)
+    return settings
+
+
+def _check_parameters(settings: Sequence[Setting], name: str) -> None:
+    """Raise ValueError unless each parameter can be a coordinate of the store: its name is free, its value plain.
+
+    `name` is that of the campaign's file, for errors.
+    """
     taken = {*DIMENSIONS, *VARIABLES, *COLUMNS}
     for i, setting in enumerate(settings):
         for key, value in setting.items():
             if not key.isidentifier() or key in taken:
                 raise fail(f"{name}, parameter {key!r}", f"a Python name other than {', '.join(sorted(taken))}", key)
             _check_json_value(value, f"{name}, {key} of setting {i}")
-    # Equal settings would have equal random keys, and so equal runs.
-    seen: dict[str, int] = {}
+
+
+def _check_distinct(settings: Sequence[Setting], name: str) -> None:
+    """Raise ValueError if two settings are equal: they would have equal random keys, and so equal runs."""
+    seen: dict[str, int] = {}  # {a setting as text: the number of the first such setting}
     for i, setting in enumerate(settings):
         first = seen.setdefault(serialise_setting(setting), i)
         if first != i:
             same = f"the same as setting {first}, {serialise_setting(setting)}"
             raise fail(f"{name}, setting {i}", "distinct settings", same)
-    return settings
 
 
 def _expand_grid(grid: object, name: str) -> list[Setting]:

@@ -209,7 +209,10 @@ def make_explore_page_html(
 ) -> str:
     """Return the page as HTML. It has the first settings, as many as have at most ROWS rows in each table.
 
-    `read_state_scores`: reads scores of single states from the store; without it there are none.
+    Args:
+        campaign: the campaign.
+        scores: scores of all states together, sorted by setting.
+        read_state_scores: reads scores of single states and steps from the store; without it there are none.
     """
     shown = _keep_first_settings(scores)
     settings = len({score.setting for score in shown})
@@ -273,10 +276,11 @@ def _make_tables(
     if read_state_scores is None:
         return [_make_scores_table(campaign, scored)]
     settings = list(dict.fromkeys(score.setting for score in scores))
+    # At most STEPS steps, spread evenly from the first to the last.
     steps = sorted({round(step) for step in np.linspace(1, campaign.horizon, min(STEPS, campaign.horizon))})
     detailed = read_state_scores(settings[:1], steps)
-    # `detailed` has the rows of the first setting here: ROWS / len(detailed) settings have ROWS rows.
-    detailed += read_state_scores(settings[1 : ROWS // max(len(detailed), 1)], steps)
+    rows_of_a_setting = max(len(detailed), 1)
+    detailed += read_state_scores(settings[1 : ROWS // rows_of_a_setting], steps)
     if len({detail.state for detail in detailed}) > 1:
         scored += [detail for detail in detailed if not detail.step]
     at_steps = [detail for detail in detailed if detail.step]
@@ -344,9 +348,9 @@ def _make_steps_table(campaign: Campaign, rows: Sequence[StateScore]) -> Explore
 
 
 def _make_columns(campaign: Campaign, rows: Sequence[StateScore], fields: Sequence[str]) -> dict[str, list[Value]]:
-    """Return the columns of a table of scores: settings, parameters, NAMES (such as node and filter), and `fields`.
+    """Return the columns of a table of scores by name, each with a value for each score in `rows`.
 
-    Each column has a value for each score in `rows`.
+    They are the setting, its parameters, node, filter and state, and the fields of `StateScore` that `fields` names.
     """
     parameters = {name: list_parameter_values(campaign, name).tolist() for name in campaign.parameters}
     return {

@@ -67,7 +67,10 @@ def run_in_processes(campaign: str, store: Path, workers: int, timeout: float = 
 
 
 def _distribute_jobs_to_workers(crew: list["_WorkerProcess"], waiting: deque[Job]) -> Iterator[tuple[Job, Reply]]:
-    """Yield each of the waiting jobs with its reply, as they end; each worker has a thread that takes jobs for it."""
+    """Yield each of the waiting jobs with its reply, as they end.
+
+    Each worker process of the `crew` has a thread here, which takes jobs for it and waits for its replies.
+    """
     finished: queue.SimpleQueue[tuple[Job, Reply]] = queue.SimpleQueue()
     count = len(waiting)
 

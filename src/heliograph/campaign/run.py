@@ -168,15 +168,26 @@ def _describe_settings_and_compute_chunks(
 ) -> dict[Job, Reply]:
     """Describe new settings, then compute the missing chunks of those that can be built; return failures, in order.
 
-    `already`: number of chunks that are there, for `progress`.
+    Args:
+        engine: does jobs, and yields each with its reply.
+        campaign: the campaign.
+        store: path of the store.
+        missing: the jobs of the chunks that are not there.
+        already: number of chunks that are there, for `progress`.
+        progress: called as progress(what, done, total).
     """
     failed = _prepare_store(engine, campaign, store, {job.setting for job in missing}, progress)
     possible = [job for job in missing if Job(job.setting) not in failed]
     total = already + len(missing)
     progress("simulating", already, total)
     failed |= _try_jobs(engine, possible, lambda job, value, done: progress("simulating", already + done, total))
-    # A setting that failed as a whole has no chunk.
-    return dict(sorted(failed.items(), key=lambda failure: (failure[0].setting, failure[0].chunk or 0)))
+
+    def order(failure: tuple[Job, Reply]) -> tuple[int, int]:
+        """Return what a failure is sorted by: setting, then chunk; a setting that failed as a whole has no chunk."""
+        job, _ = failure
+        return job.setting, job.chunk or 0
+
+    return dict(sorted(failed.items(), key=order))
 
 
 def _list_jobs(campaign: Campaign, only: Sequence[tuple[int, int]] | None) -> list[Job]:

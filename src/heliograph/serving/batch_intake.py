@@ -173,23 +173,18 @@ class BatchIntake:
         if self._refused:
             why = self._refused.get((number, timed.event.is_inputs)) or why
             why_inputs = self._refused.get((number, True)) if timed.inputs is not None else None
-        # A new plant begins with a message that is plausible and of a right clock.
         if plant is None:
-            if timed.at > timed.arrival + self.fleet.options.ahead:
-                return MessageOutcome(verdict="future")
-            nothing_is_plausible = why and (timed.inputs is None or why_inputs)
-            if nothing_is_plausible:
-                return MessageOutcome(verdict="implausible", why=why)
-            # Its first moment counts as a leap in time, by one clock that may be wrong: of arrivals, or of the sender.
-            has_arrival = message.arrival is not None
-            leap = make_first_leap(timed.arrival, ARRIVAL) if has_arrival else make_first_leap(timed.at, message.node)
-            plant = self._begin_plant(message.plant, timed.at, timed.origin, leap)
+            refusal = self._refuse_as_first(timed, why, why_inputs)
+            if refusal is not None:
+                return refusal
+            plant = self._begin_plant_by_message(message, timed)
         plant = self._note_plant_before_batch(plant, timed.at)  # so that it can be restored
         # Inputs and measurement are used or refused independently.
-        notes = list[tuple[Verdict, str]]()
         verdict_on_inputs = self._use_inputs(number, plant, message, timed, why_inputs)
         verdict = self._give_to_plant(number, plant, message, screened.event, timed.clock, why)
         self.fleet.count_event(plant, message.node, screened, verdict)
+        # What is said of parts that were left out: the verdict on each, and why.
+        notes = list[tuple[Verdict, str]]()
         # Inputs that share the measurement's verdict need no word of their own, unless they are what is implausible.
         if verdict_on_inputs == "implausible" or verdict_on_inputs not in ("used", "duplicate", verdict):
             notes.append((verdict_on_inputs, f"inputs {message.inputs}: {why_inputs or WHY[verdict_on_inputs]}"))
@@ -198,6 +193,30 @@ class BatchIntake:
         ending = "; the rest is used" if verdict == "used" else ""
         notes = [(verdict_on_part, note + ending) for verdict_on_part, note in notes]
         return MessageOutcome(plant, verdict, "" if verdict != "implausible" else why, notes)
+
+    def _refuse_as_first(self, timed: TimedEvents, why: str, why_inputs: str | None) -> MessageOutcome | None:
+        """Return the refusal of a message with which no plant can begin, or None if one can.
+
+        It must not be dated in the future, since its clock would be wrong, and something in it must be plausible.
+
+        Args:
+            timed: the events of the message.
+            why: why its measurement is implausible; "" where it is not.
+            why_inputs: the same of its inputs; None where they are plausible, or there are none.
+        """
+        if timed.at > timed.arrival + self.fleet.options.ahead:
+            return MessageOutcome(verdict="future")
+        nothing_is_plausible = why and (timed.inputs is None or why_inputs)
+        return MessageOutcome(verdict="implausible", why=why) if nothing_is_plausible else None
+
+    def _begin_plant_by_message(self, message: AnyMessage, timed: TimedEvents) -> PlantState:
+        """Return a new plant that begins with a message.
+
+        Its first moment counts as a leap in time by one clock, which may be wrong: that of arrivals, or the sender's.
+        """
+        has_arrival = message.arrival is not None
+        leap = make_first_leap(timed.arrival, ARRIVAL) if has_arrival else make_first_leap(timed.at, message.node)
+        return self._begin_plant(message.plant, timed.at, timed.origin, leap)
 
     def _use_inputs(
         self, number: int, plant: PlantState, message: AnyMessage, timed: TimedEvents, why_refused: str | None

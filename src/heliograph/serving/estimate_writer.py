@@ -87,8 +87,10 @@ class EstimateWriter:
             return []
         # The template fits rows whose numbers are finite, whose variances are not negative, and whose filters used all
         # that had arrived (reason 0). The three lists hold columns of `outputs`.
-        fits = np.isfinite(outputs[:, self._finite]).all(axis=1) & (outputs[:, self._variances] >= 0).all(axis=1)
-        fits &= (outputs[:, self._reasons] <= 0).all(axis=1)
+        is_finite = np.isfinite(outputs[:, self._finite]).all(axis=1)
+        is_sound = (outputs[:, self._variances] >= 0).all(axis=1)
+        is_used = (outputs[:, self._reasons] <= 0).all(axis=1)
+        fits = is_finite & is_sound & is_used
         # The texts of all numbers at once, row after row, in the order in which a line has them.
         gap_count, texts = len(self._order), _write_numbers(outputs[:, self._order].ravel().tolist())
         # By gap of the template, what each row has there: every `gap_count`-th text. Whole numbers have no point.
@@ -97,7 +99,8 @@ class EstimateWriter:
             by_gap[gap] = outputs[:, self._order[gap]].astype(int).tolist()
         # Each line begins with the kind, plant and time of its row; then the template takes the texts of its gaps.
         names = {plant: encode_line(plant) for plant in {plant for plant, _ in rows}}
-        head = [kind] * len(rows), [names[plant] for plant, _ in rows], _write_numbers([moment for _, moment in rows])
+        times = _write_numbers([time for _, time in rows])
+        head = [kind] * len(rows), [names[plant] for plant, _ in rows], times
         lines = [self._template % of_row for of_row in zip(*head, *by_gap, strict=True)]
         # Rows that the template does not fit are written anew, filter by filter.
         for i in np.flatnonzero(~fits).tolist():
@@ -124,9 +127,10 @@ class EstimateWriter:
         n, begin = self._n, columns.covariance
         mean, covariance = outputs[columns.mean : columns.mean + n], outputs[begin : begin + n * n]  # row by row
         # An estimate with NaN, infinity or a negative variance claims nothing.
-        claim, variances = columns.claim, covariance[:: n + 1]
-        if claim != "none" and (not all(map(isfinite, (*mean, *covariance))) or min(variances) < 0):
-            claim = "none"
+        claim, variances = columns.claim, covariance[:: n + 1]  # the diagonal
+        if claim != "none":
+            is_sound = all(map(isfinite, (*mean, *covariance))) and min(variances) >= 0
+            claim = claim if is_sound else "none"
         rows = None if columns.claim == "none" else [covariance[i : i + n] for i in range(0, n * n, n)]
         results: dict[str, object] = {"mean": mean, "covariance": rows, "claim": claim}
         if columns.modes is not None:

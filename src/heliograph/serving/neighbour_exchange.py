@@ -63,14 +63,13 @@ class NeighbourMessenger:
         A message is due once its row has the node's measurement, or once there is a later row: the step is then over.
         The returned rows are due now, and were not due before the plant's recorded changes.
         """
-        # A change is (row, (numbers, events) of the row before it), or (row, None) if the row is new. The first change
-        # of a row tells whether it had the node's measurement before all of them.
+        # The first change of a row tells whether it had the node's measurement before all of them.
         measured_before: dict[int, bool] = {}  # by id of the row
         new_rows = set[int]()
-        for row, content_before in plant.changes:
-            events_before = () if content_before is None else content_before[1]
+        for row, before in plant.changes:
+            events_before = {} if before is None else before.events
             measured_before.setdefault(id(row), self._has_measurement(events_before))
-            if content_before is None:
+            if before is None:
                 new_rows.add(id(row))
         held, due = plant.rows.held, []
         index_of_newest_before = max((i for i, row in enumerate(held) if id(row) not in new_rows), default=0)

@@ -63,7 +63,8 @@ class ForecastPublisher:
     def _convert_horizon(self, horizon: float | np.timedelta64 | np.datetime64) -> float:
         """Return how far ahead a horizon is: in steps, or in the unit of dt where time is continuous.
 
-        Spans of time are seconds there; in steps they have to be a whole number of them.
+        A number is that already. A span of time is taken in seconds if time is continuous; else it has to be a whole
+        number of steps.
         """
         if isinstance(horizon, np.datetime64):
             raise fail("--forecast", "spans of time or steps ahead of each message", str(horizon))

@@ -369,9 +369,9 @@ class Service:
 
     def _write_provisional(self, rows: Sequence[tuple[PlantState, HeldRow]]) -> list[Output]:
         """Return outputs with the estimates after these rows, forecasts from them, and the status of their senders."""
-        outputs, held = [], [row for _, row in rows]
+        outputs = []
         self._silence.note_published(rows)
-        forecasts = [None] * len(rows) if self._ahead is None else self._ahead.make_forecasts(held)
+        forecasts = [None] * len(rows) if self._ahead is None else self._ahead.make_forecasts([row for _, row in rows])
         bodies = self._write_estimates(b"provisional", rows)
         for (plant, _), body, horizons in zip(rows, bodies, forecasts, strict=True):
             # `body` is a JSON object as bytes: members are added before its closing brace, body[:-1].

@@ -383,7 +383,7 @@ async def _serve_part(
     stop: asyncio.Event,
     checked: "Store",
 ) -> None:
-    """Serve one part of the plants until `stop` is set; `checked` is the store, open before and without damage."""
+    """Serve one part of the plants until `stop` is set; `checked` is the store, which was looked through for damage."""
     from heliograph.serving.storage.store import Store
 
     assert settings.broker is not None  # the settings require one

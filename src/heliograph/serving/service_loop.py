@@ -152,7 +152,10 @@ async def _publish_in_time(
 
 
 async def _await_unless_stopped(stop: asyncio.Event, waiting: Coroutine[object, object, T]) -> T | None:
-    """Await a coroutine; cancel it and return None if `stop` is set first."""
+    """Return what a coroutine returns; if `stop` is set first, cancel it and return None.
+
+    It may still return something in spite of the cancellation: that is returned then.
+    """
     task, stopped = asyncio.ensure_future(waiting), asyncio.ensure_future(stop.wait())
     await asyncio.wait({task, stopped}, return_when=asyncio.FIRST_COMPLETED)
     stopped.cancel()

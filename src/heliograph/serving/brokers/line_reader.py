@@ -159,13 +159,13 @@ class LineReader:
         """
         if isinstance(message, InputError):
             return [str(message)]
-        own = message.topic is None and is_own_message(message.content)
-        if self._translator is not None and not own:
+        is_own = message.topic is None and is_own_message(message.content)
+        if self._translator is not None and not is_own:
             self._is_table = False
             return [*self._translator.decode(message, self._topic)]
         if read is None:
             (read,) = read_messages([json.dumps(message.content).encode()])
-        if not own:
+        if not is_own:  # nobody knows its form: `read` says why it is no message
             return [read]
         self._is_table = False
         if not isinstance(read, str | UnreadMessage):

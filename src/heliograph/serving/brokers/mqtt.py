@@ -143,10 +143,10 @@ class _Reader(Connection):
     async def receive(self) -> Batch:
         """Wait for messages, and return those that the service reads; acknowledging the batch acknowledges them all."""
         batch, payloads = list[HeldMessage](), list[Payload]()
-        # Wait until there are messages that the service reads: `_some_held` may be set although the batch before took
-        # all, and messages of topics that no source reads are acknowledged at once.
+        # Wait until there are messages that the service reads. A batch may have none: `_some_held` may be set although
+        # the batch before took all, and messages of topics that no source reads are acknowledged at once.
         while not payloads:
-            self._acknowledge(batch)
+            self._acknowledge(batch)  # the last batch, without anything to read; empty at first
             await self._some_held.wait()
             batch = self._take_held()
             payloads = [payload for held in batch for payload in self._read_payloads(held.message, held.arrival)]

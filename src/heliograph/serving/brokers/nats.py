@@ -79,7 +79,7 @@ class Nats:
             raise_if_cancelled()
             reader = await self._repeat_while_away(self._open_reader)
             messages = await self._fetch(reader)
-            # None where none came meanwhile, or the connection broke, which `_open_reader` sees.
+            # There are none if none came meanwhile, or if the connection broke: `_open_reader` then makes a new one.
             if not messages or self._has_gap(messages):
                 continue
             payloads = [payload for message in messages for payload in self._read_payloads(message)]

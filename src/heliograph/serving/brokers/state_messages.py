@@ -90,12 +90,12 @@ def make_discovery_messages(topic: str, states: Sequence[str], body: bytes, pref
     device = {"identifiers": [f"{topic.replace('/', '-')}-{encode_name(plant).replace('%', '_')}"],
               "name": plant or topic, "manufacturer": "heliograph"}  # fmt: skip
     nodes_with_senders = _read_dead_senders(estimate).keys()
-    for published, i, _ in _iterate_states(topic, states, estimate):
+    for published, i, _ in _iterate_states(topic, states, estimate):  # i: the state's index
         common = {"state_topic": published.topic, "availability_topic": availability_topic(topic), "device": device}
         for sensor in _list_sensors(published, unit_of(states[i]), published.node in nodes_with_senders):
             identity = f"{published.identity}-{sensor.key}"
             named = {"name": sensor.name, "unique_id": identity, "value_template": f"{{{{ value_json.{sensor.key} }}}}"}
-            content = json.dumps(named | common | sensor.settings).encode()
+            content = json.dumps(named | common | sensor.settings).encode()  # in the words of Home Assistant
             yield StateMessage(f"{prefix}/{sensor.kind}/{identity}/config", content)
 
 

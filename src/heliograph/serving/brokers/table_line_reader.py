@@ -88,11 +88,11 @@ class TableLineReader:
         They are events in heliograph's own form (of one node, with its name and count), rows that sources map, or rows
         of times with the measurements of all nodes.
         """
-        if {NODE, SEQUENCE} <= set(header):
+        if {NODE, SEQUENCE} <= set(header):  # events
             return IndependentRowReader(lambda row: read_own_event(self._own, row.where, convert_cells(row)))
         translator = self._translator
         if translator is not None:
-            topic = translator.topic_of_rows(self._path, header)
+            topic = translator.topic_of_rows(self._path, header)  # None: the rows name their topics, or none is known
             if topic is not None or TOPIC in header:
                 return IndependentRowReader(
                     lambda row: translator.decode(make_message_of_row(row.where, convert_cells(row)), topic)
@@ -185,14 +185,12 @@ class TimeRowReader:
         If there was a row before these, the first step is checked too. The check does not use that row's own step and
         number, so those of the first row stand in their place.
         """
-        before = [] if self._before is None else [self._before]
-        steps = cells.inputs[TIME_STEP]
-        check_time_steps(
-            np.concatenate([steps[: len(before)], steps]),
-            np.concatenate([before, time]),
-            np.concatenate([cells.numbers[: len(before)], cells.numbers]),
-            self._rows.source,
-        )
+        steps, numbers = cells.inputs[TIME_STEP], cells.numbers
+        if self._before is not None:
+            steps = np.concatenate([steps[:1], steps])
+            time = np.concatenate([[self._before], time])
+            numbers = np.concatenate([numbers[:1], numbers])
+        check_time_steps(steps, time, numbers, self._rows.source)
 
     def end(self) -> list[Payload]:
         """Return the messages of a file's rows, after all have come, and then why rows were refused.
@@ -226,7 +224,8 @@ class TimeRowReader:
 def read_own_event(reader: HeliographMessageReader, where: str, content: dict[str, object]) -> list[Payload]:
     """Return the messages of an event in heliograph's own form: its measurement, and its inputs if it has any.
 
-    If one cannot be read, its error stands there: as a text, or with its count and time if these are known.
+    In the place of one that cannot be read its error is returned: with its node, count and time if these are known,
+    else as a text.
     """
     try:
         readings_and_arrivals = reader.read(where, content)
@@ -238,6 +237,8 @@ def read_own_event(reader: HeliographMessageReader, where: str, content: dict[st
             payloads.append(_make_message(reader, reading, arrival))
         elif reading.counted is not None:
             payloads.append(UnreadMessage(_make_message(reader, reading.counted, arrival), str(reading.error)))
+        else:
+            payloads.append(str(reading.error))
     return payloads
 
 

@@ -62,7 +62,10 @@ class RunningNis:
         return float(low), float(high)
 
     def explain_doubt(self) -> str | None:
-        """Return in words why the claimed covariance is doubtful, or None if it is not or too few numbers came."""
+        """Return in words why the claimed covariance is doubtful, or None if it is not or too few numbers came.
+
+        It is if the ratio is outside its band; below the band only if the covariance is not claimed as an upper bound.
+        """
         low, high = self.band()
         if self.numbers < FEWEST:
             return None

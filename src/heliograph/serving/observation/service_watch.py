@@ -121,7 +121,10 @@ class ServiceWatch:
             self._record_batch(outputs, last)
 
     def _record_batch(self, outputs: Sequence[Output], last: BatchTimes | None) -> None:
-        """Update times, counts, points and tests by a batch's outputs; call it with `_noting` held."""
+        """Update times, counts, points of charts, and tests by a batch's outputs; call it with `_noting` held.
+
+        `last` has the times of the batch; None where nothing came.
+        """
         if last is not None:
             self._batches.observe(last)
         plants = {output.plant for output in outputs}
@@ -139,18 +142,22 @@ class ServiceWatch:
                     self._test_claims(output.plant, message["estimates"])
 
     def _test_claims(self, plant: str, estimates: Mapping[str, Mapping[str, Any]]) -> None:
-        """Add the NIS (normalised innovation squared) of a plant's newest estimates to the running tests of claims.
+        """Add a plant's newest estimates to the running tests of what filters claim of their covariances.
 
-        The outputs of filters that weigh what they receive are added to the recent innovations. Both go to the plant's
-        own statistics and to those of all plants. `estimates` holds messages by node and filter.
+        A filter's NIS (normalised innovation squared) goes to its test, and of a filter that weighs what it receives
+        each number's innovation to the recent ones. Both go to the plant's own statistics and to those of all plants.
+
+        Args:
+            plant: name of the plant.
+            estimates: published estimates by node and filter.
         """
         tests_of_plant, outputs_of_plant = self._memory.tests_of(plant), self._memory.outputs_of(plant)
         for node, filters in estimates.items():
             for name, message in filters.items():
-                squared, received = read_nis(message)
-                if squared is not None:
+                nis, received = read_nis(message)
+                if nis is not None:
                     for tests in (self.nis, tests_of_plant):
-                        tests.setdefault((node, name), RunningNis(message["claim"])).add(squared, received)
+                        tests.setdefault((node, name), RunningNis(message["claim"])).add(nis, received)
                 if message.get("outputs") and message.get("received"):
                     for outputs in (self.outputs, outputs_of_plant):
                         outputs.add(node, name, message["outputs"])
@@ -253,7 +260,13 @@ class ServiceWatch:
             } | self._describe_plant(name, since, answers.links)
 
     def _describe_plant(self, plant: str, since: int, links: Mapping[str, dict[str, int]]) -> dict[str, Any]:
-        """Return what the page says of one plant, whose counts by node are `links`, after the point `since`."""
+        """Return what the page says of one plant, which is empty where nothing of it is remembered.
+
+        Args:
+            plant: name of the plant.
+            since: number of a point of its charts: only later points are returned.
+            links: counts of its messages, by node.
+        """
         memory = self._memory
         tests, senders = memory.tests.get(plant, {}), memory.senders.get(plant, {})
         health = memory.outputs[plant].summarise_outputs() if plant in memory.outputs else []
@@ -352,11 +365,13 @@ def watch_of(network: Network, title: str, uncounted: Collection[str] = ()) -> S
     `uncounted`: nodes whose messages carry no count, so that it is not known how many are lost.
     """
     claims = network.claims()
+    # Fusions of estimates: {name: (its claim, the (node, filter) pairs that it fuses)}.
     fused = {
         name: (claims[Network.FUSED][name], [(node, fusion.filter) for node in network.nodes_with(fusion.filter)])
         for name, fusion in network.fused.items()
         if isinstance(fusion, Fusion)
     }
+    # Names of the received numbers by (node, filter); central filters receive those of all nodes.
     names: dict[tuple[str, str], Sequence[str]] = {
         (node, name): receiver.received_names for node, receiver in network.nodes.items() for name in receiver.filters
     }

@@ -101,8 +101,10 @@ def find_doubts(tests: Mapping[Name, RunningNis]) -> Iterable[FilterDoubt]:
     """
     doubts = []
     for (node, name), test in tests.items():
-        # The ratio's standard deviation is sqrt(variance) / mean. Within NEAR of these of 1, it is clearly in its band.
-        if test.numbers < FEWEST or (test.ratio - 1.0) ** 2 * test.mean**2 < NEAR**2 * test.variance:
+        # The standard deviation of the ratio is s = sqrt(variance) / mean. If |ratio - 1| < NEAR s, it is clearly in
+        # its band, which need not be computed.
+        is_near_1 = (test.ratio - 1.0) ** 2 * test.mean**2 < NEAR**2 * test.variance
+        if test.numbers < FEWEST or is_near_1:
             continue
         low, high = test.band()
         if test.explain_doubt() is not None:
