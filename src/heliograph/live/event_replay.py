@@ -132,7 +132,7 @@ def _arrival_of(event: Event) -> float:
 
 
 def _join_records(records: Sequence[Record]) -> Record:
-    """Return one record of several, one after another in time, with the same nodes and filters."""
+    """Return one record of several that follow one another in time, with the same nodes and filters."""
     estimates = {
         node: {
             filter: _stack_estimates([record.estimates[node][filter] for record in records], np.concatenate)
@@ -146,7 +146,7 @@ def _join_records(records: Sequence[Record]) -> Record:
 
 def _make_record(network: Network, moments: Sequence[tuple[float, Mapping[str, Mapping[str, Estimate]]]]) -> Record:
     """Return the record of several moments; each is (time, estimates at this time by node and filter), in order."""
-    filters_by_node = moments[0][1] if moments else {}
+    filters_by_node = moments[0][1] if moments else {}  # of the first moment: all have the same nodes and filters
     estimates = {
         node: {
             filter: _stack_estimates([estimates_then[node][filter] for _, estimates_then in moments], np.stack)

@@ -67,10 +67,12 @@ def judged_estimates_by_name(program: NetworkProgram, outputs: np.ndarray) -> di
     """
     estimates = estimates_by_name(program, outputs)
     for columns in program.filter_columns:
-        tested = columns.judgement or columns.tested  # columns of its squared distance and count
+        # Columns of the squared distance (NIS) and of how many numbers arrived: a filter's judgement, a fusion's test.
+        tested = columns.judgement or columns.tested
         if tested is None:  # it judges nothing: its estimate stands as it is
             continue
         estimate, nis = estimates[columns.node][columns.filter], float(outputs[tested.distance])
+        # Above 0 if the filter did not use what arrived.
         reason = 0.0 if columns.judgement is None else float(outputs[columns.judgement.reason])
         estimates[columns.node][columns.filter] = JudgedEstimate(
             mean=estimate.mean,

@@ -96,7 +96,8 @@ def pass_long_gap(step: Step, start: Float[np.ndarray, " state"], state: Float[n
         factors: where a state holds factors L, D of a covariance. These are not affine, but P = L D L' is.
     """
     after = _pass_silent_steps(step, state, at, count, factors)
-    return after if np.isfinite(after[np.isfinite(state)]).all() else start
+    stays_finite = np.isfinite(after[np.isfinite(state)]).all()  # what was finite is so still
+    return after if stays_finite else start
 
 
 def _pass_silent_steps(

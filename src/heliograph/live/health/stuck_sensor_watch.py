@@ -92,12 +92,13 @@ class RepeatWatch:
         this reading.
         """
         m, before = len(values), before or FIRST
-        # The fields of `Repeats`, as lists with an entry for each component; empty before the first reading. newest:
-        # last value; lengths: of its run; steps: least difference of two successive readings that differ; readings and
-        # equal: how many came, and how many equalled the one before; found: runs that became too long.
-        newest, lengths = list(before.newest or [np.nan] * m), list(before.lengths or [0] * m)
-        least_steps, readings = list(before.steps or [inf] * m), list(before.readings or [0] * m)
-        equal, found = list(before.equal or [0] * m), list(before.found or [0] * m)
+        # By component; the fields of `before` are empty before the first reading.
+        newest = list(before.newest or [np.nan] * m)  # the last value
+        lengths = list(before.lengths or [0] * m)  # how often it came in a row
+        least_steps = list(before.steps or [inf] * m)  # least difference of two successive readings that differ
+        readings = list(before.readings or [0] * m)  # how many came
+        equal = list(before.equal or [0] * m)  # how many equalled the one before
+        found = list(before.found or [0] * m)  # runs that became too long
         # For each component: the reading continues its run or begins a new one; then whether the run is now too long.
         for i, value in enumerate(values):
             if value != value:  # NaN: nothing arrived, and the run goes on

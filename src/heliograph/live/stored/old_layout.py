@@ -193,7 +193,8 @@ def _trace_paths(old: Iterable[str], new: Iterable[str]) -> dict[str, str]:
 def _flatten_path(path: str) -> str:
     """Return the path that a part had before its Gaussian was nested: '.gaussian.mean' stood as '.mean'."""
     stem, dot, name = path.rpartition(".")
-    return stem.removesuffix(NESTED) + dot + name if dot + name in (MEAN, LOWER, VARIANCES) else path
+    is_part_of_gaussian = dot + name in (MEAN, LOWER, VARIANCES)
+    return stem.removesuffix(NESTED) + dot + name if is_part_of_gaussian else path
 
 
 def _find_factored(old: Iterable[str], new: Iterable[str]) -> list[str]:

@@ -241,8 +241,9 @@ class Listener:
         topic, body = _translate_change(node, val, data)
         is_first = topic not in self.topics
         note_payload(self.topics, topic, body, time.time_ns())
-        if is_first:
-            del self.topics[topic].logged[:], self.topics[topic].late[:]
+        if is_first:  # forget the times that were just noted of it
+            statistics = self.topics[topic]
+            del statistics.logged[:], statistics.late[:]  # arrays
 
 
 def _make_client(where: Address) -> Client:
