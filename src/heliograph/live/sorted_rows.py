@@ -186,14 +186,16 @@ class SortedRows:
         return number, [(row_after, number_after)]
 
     def _find_event_of(self, node: int, indices: range) -> tuple[HeldRow, int] | None:
-        """Return the first of these rows with an event of `node`, and the event's running count, or None.
+        """Return the first row with an event of a node, and the event's running count; None if there is none.
 
-        An event's name is (node, running count, time measured).
+        Args:
+            node: index of the node.
+            indices: indices of the rows to look at, in this order.
         """
         for i in indices:
-            for name in self.held[i].events:
-                if name[0] == node:
-                    return self.held[i], name[1]
+            for node_of_event, running_count, _time in self.held[i].events:
+                if node_of_event == node:
+                    return self.held[i], running_count
         return None
 
     def find_base(self, watermark: float) -> tuple[int, int]:

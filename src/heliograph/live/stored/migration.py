@@ -192,7 +192,10 @@ class PlantMigration:
         return can_read_layout(shapes_before, shapes_now)
 
     def migrate(self, bodies: Mapping[str, bytes]) -> dict[str, bytes]:
-        """Return {name of a plant: its bytes as this network stores them}, from the bytes that are stored."""
+        """Return {name of a plant: its bytes as this network stores them}, from the bytes that are stored.
+
+        The plants are in the fleet only for as long as it takes to step their rows again.
+        """
         plants = {name: unpack_plant(name, self._translate_plant(body), self.fleet) for name, body in bodies.items()}
         # All rows after the base are stepped again, with the network as it is now.
         for plant in plants.values():

@@ -165,11 +165,11 @@ def _is_lost_flag(part: _StatePart, end: int, taken: set[int]) -> bool:
 def factorise_covariance(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the factors of P = L D L': L's entries below the diagonal (..., n (n - 1) / 2), by row, and D (..., n).
 
-    Many covariances P (..., n, n) are eliminated at once. A pivot below n eps times its variance is rounding, and is
-    set to this bound.
+    Many covariances P (..., n, n) are eliminated at once, column by column: with the remainder R, at first P, the pivot
+    is D_j = R_jj, the column of L below the diagonal is l = R_ij / D_j (i > j), and R goes on as R - l D_j l'. A pivot
+    below n eps times its variance is rounding, and is set to this bound.
     """
     n = covariance.shape[-1]
-    # `remainder` is what is left of P after the columns before j are eliminated.
     remainder, diagonal_of_P = covariance.copy(), np.diagonal(covariance, axis1=-2, axis2=-1)
     L, D = np.zeros_like(remainder), np.zeros_like(diagonal_of_P)
     for j in range(n):
