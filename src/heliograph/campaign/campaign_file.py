@@ -17,8 +17,8 @@ KEEP = ("errors", "trajectories")
 # Names that the store's variables and the table's columns have already.
 VARIABLES = ("error", "variance", "nees_per_dimension", "truth", "measurement", "claim")
 COLUMNS = ("rmse", "rmse_error", "nees_error", "runs", "finite_runs")
-CHUNK = 256
-TIMEOUT = 3600.0  # seconds, compiling included
+CHUNK = 256  # runs that are computed and stored at once, if the file does not say
+TIMEOUT = 3600.0  # seconds, compiling included, if the file does not say
 
 
 def load_campaign(path: str | Path) -> Campaign:
@@ -74,6 +74,8 @@ def read_campaign(text: str, source: str, path: Path) -> Campaign:
             raise fail(f"{name}, key {key!r}", f"one of {', '.join(KEYS)}", f"an unknown key{hint}")
     # Each reader checks its key and raises one line.
     runs, horizon = _read_positive_integer(table, "runs", name), _read_positive_integer(table, "horizon", name)
+    # BLOCK runs are simulated side by side: a chunk has at most all runs, rounded up to a multiple of it.
+    all_runs_rounded_up = BLOCK * math.ceil(runs / BLOCK)
     return Campaign(
         text=text,
         network=_read_network(table, name),
@@ -82,8 +84,7 @@ def read_campaign(text: str, source: str, path: Path) -> Campaign:
         horizon=horizon,
         runs=runs,
         seed=check_seed(f"{name}, seed", table.get("seed", 0)),
-        # At most all runs, rounded up to a multiple of BLOCK.
-        chunk=min(_read_chunk_size(table.get("chunk", CHUNK), name), BLOCK * -(-runs // BLOCK)),
+        chunk=min(_read_chunk_size(table.get("chunk", CHUNK), name), all_runs_rounded_up),
         keep=_read_choice(table.get("keep", KEEP[0]), KEEP, f"{name}, keep"),
         inputs=_read_inputs(table.get("inputs", {}), horizon, name),
         settings=_read_settings(table, name),
@@ -101,7 +102,10 @@ def _parse_toml(text: str, name: str) -> dict[str, object]:
 
 
 def _read_network(table: Mapping[str, object], name: str) -> str:
-    """Return the name of the function that makes the network, as FILE:FUNCTION."""
+    """Return the name of the function that makes the network, as FILE:FUNCTION.
+
+    `table` is the campaign's file, and `name` its name, for errors.
+    """
     value = table.get("network")
     file, _, function = value.rpartition(":") if isinstance(value, str) else ("", "", "")
     if not file.endswith(".py") or not function.isidentifier():
@@ -116,8 +120,8 @@ def _format_value_for_error(value: object) -> str:
 
 
 def _read_positive_integer(table: Mapping[str, object], key: str, name: str) -> int:
-    """Return the value of a key, a whole number from 1."""
-    return check_count(f"{name}, {key}", table.get(key, "none"))
+    """Return the value of a key, a whole number from 1; ValueError names the file (`name`) and the key."""
+    return check_count(f"{name}, {key}", table.get(key, "none"))  # "none" is shown if the key is missing
 
 
 def _read_chunk_size(value: object, name: str) -> int:
@@ -129,7 +133,7 @@ def _read_chunk_size(value: object, name: str) -> int:
 
 
 def _read_timeout(value: object, name: str) -> float:
-    """Return the seconds of a timeout, a positive number."""
+    """Return the seconds of a timeout, a positive number; ValueError names the file, `name`."""
     if not isinstance(value, int | float) or not _is_number(value) or value <= 0:
         raise fail(f"{name}, timeout", "a positive number of seconds", _format_value_for_error(value))
     return float(value)
@@ -143,7 +147,13 @@ def _read_choice(value: object, choices: Sequence[str], name: str) -> str:
 
 
 def _read_inputs(table: object, horizon: int, name: str) -> dict[str, float | list[float]]:
-    """Return the inputs of a campaign's file by name, each a number or one number for each step."""
+    """Return the inputs of a campaign's file by name, each a number or a list with a number for each step.
+
+    Args:
+        table: the value of the key `inputs`.
+        horizon: number of steps.
+        name: name of the file, for errors.
+    """
     if not isinstance(table, dict):
         raise fail(f"{name}, inputs", "a table of numbers by the input's name", repr(table))
     for key, value in table.items():
@@ -171,21 +181,32 @@ def _read_settings(table: Mapping[str, object], name: str) -> list[Setting]:
     if ("grid" in table) == ("settings" in table):
         raise fail(f"campaign {name}", "either [grid] or [[settings]]", "both" if "grid" in table else "neither")
     settings = _expand_grid(table["grid"], name) if "grid" in table else _read_listed_settings(table["settings"], name)
-    # Parameters become coordinates of the store: their names must be free there, their values plain.
+    _check_parameters(settings, name)
+    _check_distinct(settings, name)
+    return settings
+
+
+def _check_parameters(settings: Sequence[Setting], name: str) -> None:
+    """Raise ValueError unless each parameter can be a coordinate of the store: its name is free, its value plain.
+
+    `name` is that of the campaign's file, for errors.
+    """
     taken = {*DIMENSIONS, *VARIABLES, *COLUMNS}
     for i, setting in enumerate(settings):
         for key, value in setting.items():
             if not key.isidentifier() or key in taken:
                 raise fail(f"{name}, parameter {key!r}", f"a Python name other than {', '.join(sorted(taken))}", key)
             _check_json_value(value, f"{name}, {key} of setting {i}")
-    # Equal settings would have equal random keys, and so equal runs.
-    seen: dict[str, int] = {}
+
+
+def _check_distinct(settings: Sequence[Setting], name: str) -> None:
+    """Raise ValueError if two settings are equal: they would have equal random keys, and so equal runs."""
+    seen: dict[str, int] = {}  # {a setting as text: the number of the first such setting}
     for i, setting in enumerate(settings):
         first = seen.setdefault(serialise_setting(setting), i)
         if first != i:
             same = f"the same as setting {first}, {serialise_setting(setting)}"
             raise fail(f"{name}, setting {i}", "distinct settings", same)
-    return settings
 
 
 def _expand_grid(grid: object, name: str) -> list[Setting]:

@@ -91,7 +91,7 @@ class Campaign:
             yield from self.chunks(setting)
 
     def words(self, setting: int) -> tuple[int, int]:
-        """Return the two 32-bit words that identify a setting in its key: a hash of its own values.
+        """Return the two 32-bit words that stand for a setting in its random key: the first of a hash of its values.
 
         Other settings can therefore be added or removed without changing this setting's runs.
         """
@@ -99,14 +99,14 @@ class Campaign:
         return int.from_bytes(digest[:4], "big"), int.from_bytes(digest[4:8], "big")
 
     def key(self, setting: int) -> jax.Array:
-        """Return the random key with which `monte_carlo` simulates one setting."""
+        """Return the random key with which `monte_carlo` simulates one setting: the seed with the setting's words."""
         key = seed_key(self.seed)
         for word in self.words(setting):
             key = jax.random.fold_in(key, np.uint32(word))
         return key
 
     def function(self) -> Callable[..., Network]:
-        """Return the function that builds the network of a setting; loaded once in a process."""
+        """Return the function that builds a setting's network from its parameters; loaded once in a process."""
         file, _, name = self.network.rpartition(":")
         return _load_function_once(str(Path(self.path).parent / file), self.source, name)
 
@@ -127,7 +127,10 @@ def parse_campaign(text: str) -> Campaign:
 
 
 def collect_versions() -> dict[str, str]:
-    """Return what the stored bytes depend on in addition to the campaign: packages, and configuration of JAX."""
+    """Return what the stored results depend on to the bit, besides the campaign itself, by name.
+
+    That is the versions of packages, and of JAX its settings, the flags of its compiler, and the kind of device.
+    """
     settings = {name: str(jax.config.values[name]) for name in SETTINGS}
     return _list_versions() | {"XLA_FLAGS": os.environ.get("XLA_FLAGS", ""), "device": jax.default_backend()} | settings
 

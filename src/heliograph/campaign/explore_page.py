@@ -54,9 +54,13 @@ class StateScore:
 def list_state_scores(
     store: Path, campaign: Campaign, settings: Sequence[int], steps: Sequence[int]
 ) -> list[StateScore]:
-    """Return the scores of every state of every filter in these settings: over all steps (0), then at each of `steps`.
+    """Return the scores of every state of every filter: over all steps (0), then at each of `steps`.
 
-    Of the chunks (runs of a setting) that the store has.
+    Args:
+        store: path of the store, of which the runs that are there count.
+        campaign: the campaign.
+        settings: numbers of the settings.
+        steps: numbers of the steps, from 1.
     """
     group, labels = zarr.open_group(store, mode="r"), read_labels(store)
     claims, done = np.asarray(group[CLAIM]), find_done_chunks(store, campaign)
@@ -66,8 +70,9 @@ def list_state_scores(
         sums_of_chunks = [
             _sum_errors(group, setting, slice(chunk.start, chunk.stop), claims[setting], steps) for chunk in chunks
         ]
-        if sums_of_chunks:  # of all chunks together, field by field
-            sums = ErrorSums(*(np.sum(of_field, axis=0) for of_field in zip(*sums_of_chunks, strict=True)))
+        if sums_of_chunks:
+            runs, values, squares = (np.sum(of_field, axis=0) for of_field in zip(*sums_of_chunks, strict=True))
+            sums = ErrorSums(runs, values, squares)  # of all chunks together
             results += _compute_state_scores(setting, labels, claims[setting], [0, *steps], sums)
     return results
 
@@ -99,16 +104,16 @@ def _sum_errors(group: zarr.Group, setting: int, runs: slice, claims: np.ndarray
     """
     error, variance = (np.asarray(group[name][setting, runs]) for name in ("error", "variance"))  # type: ignore[index]
     squared = error**2
-    # `counts` (run, node, filter): whether a run is finite at all steps and in all states.
+    # (run, node, filter): whether a run is finite at all steps and in all states, and counts.
     has_variance = np.isfinite(variance).all(axis=(1, -1)) | (claims == "none")
-    counts = np.isfinite(squared).all(axis=(1, -1)) & has_variance
+    is_finite = np.isfinite(squared).all(axis=(1, -1)) & has_variance
     with np.errstate(divide="ignore", invalid="ignore"):
         numbers = np.stack([squared, variance, squared / variance])
     # Along the axis of steps of (number, run, step, node, filter, state): the mean over all, and then the given steps.
     mean_over_steps, at_steps = numbers.mean(axis=2, keepdims=True), numbers[:, :, [step - 1 for step in steps]]
     selected = np.concatenate([mean_over_steps, at_steps], axis=2)
-    selected = np.where(counts[None, :, None, :, :, None], selected, 0.0)
-    return ErrorSums(runs=counts.sum(axis=0), values=selected.sum(axis=1), squares=(selected**2).sum(axis=1))
+    selected = np.where(is_finite[None, :, None, :, :, None], selected, 0.0)
+    return ErrorSums(runs=is_finite.sum(axis=0), values=selected.sum(axis=1), squares=(selected**2).sum(axis=1))
 
 
 def _compute_state_scores(
@@ -138,7 +143,7 @@ def _compute_state_scores(
         rmse, claimed = np.sqrt(mean_squared_error), np.sqrt(mean_claimed_variance)
         rmse_error = np.where(rmse > 0, error_of_squared / (2 * rmse), 0.0)  # of a root, to first order
     scores = []
-    for k, i, j, s in np.ndindex(rmse.shape):
+    for k, i, j, s in np.ndindex(rmse.shape):  # step, node, filter, state
         if claims[i, j]:  # else the node has no such filter
             scores.append(
                 StateScore(
@@ -204,7 +209,10 @@ def make_explore_page_html(
 ) -> str:
     """Return the page as HTML. It has the first settings, as many as have at most ROWS rows in each table.
 
-    `read_state_scores`: reads scores of single states from the store; without it there are none.
+    Args:
+        campaign: the campaign.
+        scores: scores of all states together, sorted by setting.
+        read_state_scores: reads scores of single states and steps from the store; without it there are none.
     """
     shown = _keep_first_settings(scores)
     settings = len({score.setting for score in shown})
@@ -268,10 +276,11 @@ def _make_tables(
     if read_state_scores is None:
         return [_make_scores_table(campaign, scored)]
     settings = list(dict.fromkeys(score.setting for score in scores))
+    # At most STEPS steps, spread evenly from the first to the last.
     steps = sorted({round(step) for step in np.linspace(1, campaign.horizon, min(STEPS, campaign.horizon))})
     detailed = read_state_scores(settings[:1], steps)
-    # `detailed` has the rows of the first setting here: ROWS / len(detailed) settings have ROWS rows.
-    detailed += read_state_scores(settings[1 : ROWS // max(len(detailed), 1)], steps)
+    rows_of_a_setting = max(len(detailed), 1)
+    detailed += read_state_scores(settings[1 : ROWS // rows_of_a_setting], steps)
     if len({detail.state for detail in detailed}) > 1:
         scored += [detail for detail in detailed if not detail.step]
     at_steps = [detail for detail in detailed if detail.step]
@@ -299,8 +308,8 @@ def _convert_to_state_score(score: Score) -> StateScore:
 def _make_scores_table(campaign: Campaign, rows: Sequence[StateScore]) -> ExploredTable:
     """Return the table of each filter's scores over all steps, and how it is drawn at first.
 
-    x: its horizontal axis. panel: a column with one plot for each value. whole: columns whose values are all shown.
-    unordered: a column whose values have no order.
+    `x` is the column of the horizontal axis, `panel` a column with one plot for each of its values, `whole` are columns
+    whose values are all shown at first, and points along the column `unordered` are not connected.
     """
     columns, parameters = _make_columns(campaign, rows, SCORED), list(campaign.parameters)
     x = _choose_axis(columns, parameters)
@@ -339,9 +348,9 @@ def _make_steps_table(campaign: Campaign, rows: Sequence[StateScore]) -> Explore
 
 
 def _make_columns(campaign: Campaign, rows: Sequence[StateScore], fields: Sequence[str]) -> dict[str, list[Value]]:
-    """Return the columns of a table of scores: settings, parameters, NAMES (such as node and filter), and `fields`.
+    """Return the columns of a table of scores by name, each with a value for each score in `rows`.
 
-    Each column has a value for each score in `rows`.
+    They are the setting, its parameters, node, filter and state, and the fields of `StateScore` that `fields` names.
     """
     parameters = {name: list_parameter_values(campaign, name).tolist() for name in campaign.parameters}
     return {

@@ -44,8 +44,8 @@ def read_failures(out: Path) -> list[FailedJob]:
 def make_failed_job(campaign: Campaign, out: Path, job: Job, reply: Reply) -> FailedJob:
     """Return the failure of a job, from its last reply, with everything that is needed to repeat it."""
     # A job without a chunk builds the setting's network, so its failure concerns all the setting's runs.
-    chunks = campaign.chunks(job.setting)
-    chunks = chunks if job.chunk is None else [chunks[job.chunk]]
+    all_chunks = campaign.chunks(job.setting)
+    chunks = all_chunks if job.chunk is None else [all_chunks[job.chunk]]
     return FailedJob(
         setting=job.setting,
         parameters=campaign.settings[job.setting],
@@ -66,7 +66,7 @@ def write_failures(out: Path, failures: list[FailedJob], tried: list[Job]) -> No
     """
     path = out / FAILURES
     partial = path.with_name(f".{path.name}.partial")
-    jobs = {*tried, *(Job(job.setting) for job in tried)}
+    jobs = {*tried, *(Job(job.setting) for job in tried)}  # a job without a chunk is that of the setting as a whole
     earlier = [failure for failure in read_failures(out) if Job(failure.setting, failure.chunk) not in jobs]
     entries = [asdict(failure) for failure in (*earlier, *failures)]
     if not entries:

@@ -51,7 +51,7 @@ def start_engine(
 
 @contextmanager
 def run_in_this_process(campaign: str, store: Path) -> Iterator[Engine]:
-    """Do one job after another in this process."""
+    """Yield an engine that does one job after another in this process."""
     yield lambda jobs: ((job, perform_job(campaign, str(store), job.setting, job.chunk)) for job in jobs)
 
 
@@ -67,7 +67,10 @@ def run_in_processes(campaign: str, store: Path, workers: int, timeout: float = 
 
 
 def _distribute_jobs_to_workers(crew: list["_WorkerProcess"], waiting: deque[Job]) -> Iterator[tuple[Job, Reply]]:
-    """Yield each of the waiting jobs with its reply, as they end; each worker has a thread that takes jobs for it."""
+    """Yield each of the waiting jobs with its reply, as they end.
+
+    Each worker process of the `crew` has a thread here, which takes jobs for it and waits for its replies.
+    """
     finished: queue.SimpleQueue[tuple[Job, Reply]] = queue.SimpleQueue()
     count = len(waiting)
 
@@ -90,8 +93,15 @@ class _WorkerProcess:
     """A worker process and the pipes to it: a job is a line of JSON, its reply another."""
 
     def __init__(self, campaign: str, store: Path, timeout: float):
-        """Begin without a process, since the first job starts it; a job may take `timeout` seconds."""
-        self.greeting, self.timeout = json.dumps([campaign, str(store)]), timeout
+        """Begin without a process, since the first job starts it.
+
+        Args:
+            campaign: the campaign as JSON.
+            store: path of the store, into which the process writes.
+            timeout: seconds that a job may take.
+        """
+        self.greeting = json.dumps([campaign, str(store)])  # the first line that a process reads
+        self.timeout = timeout
         self.process: subprocess.Popen[str] | None = None
         self.stopped = False
 
@@ -179,7 +189,7 @@ def _describe_exit(code: int) -> str:
 
 @contextmanager
 def run_on_cluster(campaign: str, store: Path, address: str, timeout: float = math.inf) -> Iterator[Engine]:
-    """Do jobs on a Dask cluster whose workers have this package and see the store's folder.
+    """Yield an engine that does jobs on a Dask cluster, whose workers have this package and see the store's folder.
 
     Dask repeats the jobs of a worker that dies. Jobs are given up when none came back for `timeout` seconds.
 
@@ -189,7 +199,7 @@ def run_on_cluster(campaign: str, store: Path, address: str, timeout: float = ma
     """
     from distributed import Client
 
-    start: Untyped = Client
+    start: Untyped = Client  # dask.distributed has no types
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what there is to say is said in one line
     try:
         client = start(address, set_as_default=False, timeout=CONNECT)

@@ -83,9 +83,9 @@ def compute_chunk(campaign: Campaign, network: Network, chunk: Chunk, store: Pat
     """
     if not store.is_dir():
         raise fail("results folder", f"a folder {store} that this machine sees", "nothing of that name")
-    labels = read_labels(store)
+    labels = read_labels(store)  # names along the axes of the store
     check_labels_within(restore_labels(describe_network(network)["labels"]), labels, chunk.setting)
-    # Full width, whatever the chunk has; only its own runs are written.
+    # As many runs as a full chunk has; only the chunk's own are written.
     recorded = monte_carlo(
         network,
         horizon=campaign.horizon,
@@ -114,7 +114,10 @@ def make_network_inputs(campaign: Campaign, network: Network) -> np.ndarray | No
 
 
 def _check_versions(campaign: Campaign) -> None:
-    """Raise ValueError if this worker's packages or settings are not those with which the campaign began."""
+    """Raise ValueError if this worker's packages or settings are not those with which the campaign began.
+
+    Its results would then not be the same to the bit.
+    """
     here = collect_versions()
     if here != campaign.versions:
         raise fail("versions on this worker", str(campaign.versions), here)
@@ -131,11 +134,11 @@ def _build_network(campaign: str, setting: int) -> Network:
     return network
 
 
-_seen: list[Network] = []
+_seen: list[Network] = []  # one network of each structure since compiled programs were last dropped
 
 
 def _drop_old_programs(network: Network) -> None:
-    """Drop all compiled programs if networks of COMPILED other structures came before this one.
+    """Drop all compiled programs if networks of COMPILED (16) other structures came before this one, to bound memory.
 
     Networks of one structure share their programs. `_seen` holds a network of each structure since the last drop.
     """
@@ -148,9 +151,9 @@ def _drop_old_programs(network: Network) -> None:
 
 
 def _arrange_results(recorded: PyTree, labels: AxisLabels) -> dict[str, np.ndarray]:
-    """Return the reducer's results by variable of the store, on its axes (run, time, node, filter, ...).
+    """Return the results of `ErrorReducer` by variable of the store, as arrays (run, time, node, filter, ...).
 
-    A node without a filter has NaN in its place.
+    Where a node has no such filter there is NaN.
 
     Args:
         recorded: "estimates" by node and filter, with "error", "variance" and "nees_per_dimension" (run, time, ...);
@@ -209,8 +212,11 @@ class ErrorReducer(AbstractReducer[dict[str, PyTree]]):
     def finish(self, carry: PyTree, collected: PyTree, network: Network) -> dict[str, PyTree]:
         """Return the collected errors by node and filter, and with `self.world` also truth and measurements.
 
-        Collected errors have the axes (..., filter, node, state), so that filters are axis -3. NEES has no axis of
-        states.
+        Args:
+            carry: what is carried from step to step; nothing here.
+            collected: what `of_step` returned, of all steps. Errors have the axes (..., filter, node, state), so that
+                filters are axis -3; NEES has no axis of states.
+            network: the network, which has the names.
         """
         results = {
             field: self.split_by_name(network, collected, itemgetter(field), axis)

@@ -39,7 +39,8 @@ def write_campaign_report(campaign: Campaign, scores: Sequence[Score], out: Path
 def make_campaign_page(campaign: Campaign, scores: Sequence[Score], failures: Sequence[FailedJob]) -> Page:
     """Return the page of a campaign with its scores and failures."""
     name = Path(campaign.path).name
-    computed = sum({score.setting: score.runs for score in scores}.values())
+    runs_by_setting = {score.setting: score.runs for score in scores}  # all scores of a setting have the same runs
+    computed = sum(runs_by_setting.values())
     # Failures first, so that nobody reads the results without them.
     return Page(
         kicker="Heliograph campaign",
@@ -116,7 +117,7 @@ def make_score_table(campaign: Campaign, scores: Sequence[Score]) -> Table:
 
 
 def _explain_opening_in_python(campaign: Campaign) -> Section:
-    """Return the section that shows how to open the errors of all runs in Python."""
+    """Return the section of the page that shows how to open the errors of all runs in Python."""
     lines = [
         "import heliograph as hg",
         "",
@@ -157,8 +158,8 @@ def _can_be_axis(campaign: Campaign, name: str) -> bool:
     values = list_parameter_values(campaign, name)
     if values.dtype.kind not in "if" or not np.all(np.isfinite(values)):
         return False
-    rests = [serialise_setting(_drop_parameter(setting, name)) for setting in campaign.settings]
-    return len(set(rests)) < len(rests)
+    other_parameters = [serialise_setting(_drop_parameter(setting, name)) for setting in campaign.settings]
+    return len(set(other_parameters)) < len(other_parameters)
 
 
 def _drop_parameter(setting: Setting, name: str) -> Setting:
@@ -173,7 +174,7 @@ def plot_by_parameter(campaign: Campaign, scores: Sequence[Score], parameter: st
     There is one panel for each node and each choice of the other parameters, PANELS at most.
     """
     values = list_parameter_values(campaign, parameter)  # by setting
-    shown = dict(list(_group_into_panels(campaign, scores, parameter).items())[:PANELS])
+    shown = dict(list(_group_into_panels(campaign, scores, parameter).items())[:PANELS])  # title: scores
     figure, grid = _make_panels(len(shown), 2.5)
     colours = _assign_colours(scores)
     for axes, (title, of_panel) in zip(grid, shown.items(), strict=False):  # the grid may end with an empty place
@@ -193,7 +194,10 @@ def plot_by_parameter(campaign: Campaign, scores: Sequence[Score], parameter: st
 
 
 def _group_into_panels(campaign: Campaign, scores: Sequence[Score], parameter: str) -> dict[str, list[Score]]:
-    """Return {title of a panel: its scores}: those of one node whose settings differ only in `parameter`."""
+    """Return {title of a panel: its scores}: those of one node whose settings differ only in `parameter`.
+
+    The title names the node, and the values of all other parameters.
+    """
     panels: dict[str, list[Score]] = {}
     for score in scores:
         rest = _drop_parameter(campaign.settings[score.setting], parameter)

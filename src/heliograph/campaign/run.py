@@ -33,7 +33,8 @@ from heliograph.numerics.module import readable
 
 TRIES = 3  # a job that fails is tried again after the others, in case its worker was to blame
 Progress = TypeAliasType("Progress", Callable[[str, int, int], None])
-Accept = Callable[[Job, NetworkDescription | None, int], None]  # a job, what it gave, and how many are done
+# Called as accept(job, its value, how many jobs are done) for each job that succeeds.
+Accept = Callable[[Job, NetworkDescription | None, int], None]
 
 
 @readable
@@ -167,15 +168,26 @@ def _describe_settings_and_compute_chunks(
 ) -> dict[Job, Reply]:
     """Describe new settings, then compute the missing chunks of those that can be built; return failures, in order.
 
-    `already`: number of chunks that are there, for `progress`.
+    Args:
+        engine: does jobs, and yields each with its reply.
+        campaign: the campaign.
+        store: path of the store.
+        missing: the jobs of the chunks that are not there.
+        already: number of chunks that are there, for `progress`.
+        progress: called as progress(what, done, total).
     """
     failed = _prepare_store(engine, campaign, store, {job.setting for job in missing}, progress)
     possible = [job for job in missing if Job(job.setting) not in failed]
     total = already + len(missing)
     progress("simulating", already, total)
     failed |= _try_jobs(engine, possible, lambda job, value, done: progress("simulating", already + done, total))
-    # A setting that failed as a whole has no chunk.
-    return dict(sorted(failed.items(), key=lambda failure: (failure[0].setting, failure[0].chunk or 0)))
+
+    def order(failure: tuple[Job, Reply]) -> tuple[int, int]:
+        """Return what a failure is sorted by: setting, then chunk; a setting that failed as a whole has no chunk."""
+        job, _ = failure
+        return job.setting, job.chunk or 0
+
+    return dict(sorted(failed.items(), key=order))
 
 
 def _list_jobs(campaign: Campaign, only: Sequence[tuple[int, int]] | None) -> list[Job]:
@@ -203,7 +215,10 @@ def _count_workers(workers: int | None, jobs: int) -> int:
 def _prepare_store(
     engine: Engine, campaign: Campaign, store: Path, settings: set[int], progress: Progress
 ) -> dict[Job, Reply]:
-    """Make the store if needed, and write missing claims; return the jobs of settings that cannot be built.
+    """Make the store if needed, and describe in it the settings; return the jobs of settings that cannot be built.
+
+    A setting is described by its labels, the names of its states, nodes and filters, which are those along the store's
+    axes; and by its claims, what each filter says that its covariance is ("exact", "upper", ...).
 
     Args:
         engine: does the jobs that describe a setting: build its network, and return its labels and claims.
@@ -216,7 +231,8 @@ def _prepare_store(
     if is_new:
         without_claims = list(range(len(campaign.settings)))
     else:
-        # Claims of the settings to compute, and of those that were begun: they may have been removed as damaged.
+        # Of the settings to compute, and of those of which chunks are there: their claims may have been damaged, and
+        # then removed.
         begun = {setting for setting, _ in find_done_chunks(store, campaign)}
         without_claims = sorted((settings | begun) - {setting for (setting,) in find_described_settings(store)})
     jobs = [Job(setting) for setting in without_claims]
@@ -232,7 +248,7 @@ def _prepare_store(
     if is_new and not described:
         first = next(iter(failed.values()))
         raise fail("campaign", "a setting whose network can be built", f"none: setting 0 gave {first.error}")
-    # The names along the axes of a new store are those of all settings; settings that come later must fit into them.
+    # A new store has the names of all settings along its axes; settings that come later must fit into them.
     labels = {setting: restore_labels(described[setting]["labels"]) for setting in sorted(described)}
     if is_new:
         create_store(store, campaign, unite_labels(labels))
@@ -242,15 +258,18 @@ def _prepare_store(
     return failed
 
 
-def _try_jobs(
-    engine: Engine, jobs: Iterable[Job], accept: Callable[[Job, NetworkDescription | None, int], None]
-) -> dict[Job, Reply]:
+def _try_jobs(engine: Engine, jobs: Iterable[Job], accept: Accept) -> dict[Job, Reply]:
     """Do jobs, failed ones again, up to TRIES times; return those that still fail, with their last replies.
 
-    `accept`: called as accept(job, value, number done) for each that succeeds. One that took too long is not repeated.
+    A job that took too long is not repeated.
+
+    Args:
+        engine: does jobs, and yields each with its reply.
+        jobs: the jobs.
+        accept: called for each job that succeeds, with its value and the number of jobs done so far.
     """
     done, left = 0, {job: Reply() for job in jobs}
-    given_up: list[Job] = []  # what took too long once is not waited for again
+    given_up: list[Job] = []  # jobs that took too long
     for _ in range(TRIES):
         for job, reply in engine([job for job in left if job not in given_up]):
             if not reply.error:

@@ -133,9 +133,15 @@ def _read_runs(group: zarr.Group, name: str, setting: int, runs: slice) -> np.nd
 
 
 def _make_score(setting: int, node: str, name: str, claim: str, squared: np.ndarray, nees: np.ndarray) -> Score:
-    """Return RMSE and NEES of the filter `name` with their standard errors.
+    """Return RMSE and NEES of a filter, with their standard errors, over the runs whose error is finite.
 
-    `squared`, `nees`: its squared error and NEES in each run (run,).
+    Args:
+        setting: number of the setting.
+        node: name of the node.
+        name: name of the filter.
+        claim: what the filter says that its covariance is.
+        squared: squared error of each run, mean over time (run,); NaN where it does not count.
+        nees: NEES per dimension of each run, mean over time (run,).
     """
     finite = np.isfinite(squared)
     mse, mse_error = _compute_mean_and_error(squared[finite])
@@ -156,7 +162,10 @@ def _make_score(setting: int, node: str, name: str, claim: str, squared: np.ndar
 
 
 def _compute_mean_and_error(values: np.ndarray) -> tuple[float, float]:
-    """Return the mean of independent values and its standard error; both are NaN without values, the error for one."""
+    """Return the mean of n independent values and its standard error, their deviation over the root of n.
+
+    Both are NaN without values; of one value the error is.
+    """
     count = len(values)
     if count == 0:
         return np.nan, np.nan

@@ -104,7 +104,7 @@ def _select_chunks(campaign: Campaign, setting: int | None, chunk: int | None) -
 
 
 def _count_chunks(run: CampaignRun) -> str:
-    """Return in words how many chunks were computed, and how many were already there."""
+    """Return in words how many chunks (runs of a setting, stored together) were computed, and how many were there."""
     if not run.computed and not run.failures:
         return f"{run.folder}: nothing to compute, all {run.already} chunks are already there"
     return f"{run.folder}: {run.computed} chunks computed, {run.already} were already there"

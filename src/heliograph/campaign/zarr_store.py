@@ -54,7 +54,10 @@ class NetworkDescription(TypedDict):
 
 
 def describe_network(network: Network) -> NetworkDescription:
-    """Return labels of one network (states, nodes, filters, longest measurement) and claims of its filters."""
+    """Return labels of one network (states, nodes, filters, longest measurement) and claims of its filters.
+
+    A claim says what a filter's covariance is, such as "exact" or "upper".
+    """
     claims: Claims = {node: dict(filters) for node, filters in network.claims().items()}
     labels = LabelsAsJson(
         states=network.states,
@@ -123,9 +126,12 @@ def list_stored_variables(campaign: Campaign) -> dict[str, tuple[tuple[str, ...]
 def create_store(path: Path, campaign: Campaign, labels: AxisLabels) -> None:
     """Create the store of a campaign, complete except for the claims and the chunks of runs.
 
-    A campaign simulates many settings with many runs each; jobs write chunks of runs into this store later, each into
-    files of its own. `labels`: names along the store's axes (nodes, filters, states and so on). `campaign`: the
-    definition, with the text and versions that the store records.
+    Jobs write chunks of runs into it later, each into files of its own.
+
+    Args:
+        path: where the store is made; it appears at once when it is complete.
+        campaign: the definition, whose text and versions the store records.
+        labels: names along the store's axes: states, nodes, filters.
     """
     with whole_folder(path) as folder:
         attributes = {
@@ -144,7 +150,7 @@ def create_store(path: Path, campaign: Campaign, labels: AxisLabels) -> None:
         sizes = {name: len(values) for name, values in coordinates.items()}
         for name, (axes, meaning) in list_stored_variables(campaign).items():
             shape = tuple(sizes[axis] for axis in axes)
-            chunks = (1, campaign.chunk, *shape[2:])
+            chunks = (1, campaign.chunk, *shape[2:])  # the axes are setting, run, and then all others
             _create_array(group, name, axes, shape, chunks, fill=np.nan, attributes={"long_name": meaning})
         shape = tuple(sizes[axis] for axis in CLAIM_AXES)
         meaning = "what the filter claims of its variance"
@@ -288,7 +294,7 @@ def remove_damaged_chunks(path: Path, campaign: Campaign) -> list[Path]:
 
 
 def _has_right_checksum(file: Path) -> bool:
-    """Return whether the last four bytes are the checksum of all others."""
+    """Return whether the last four bytes of a file are the checksum (CRC-32C) of all others."""
     data = file.read_bytes()
     return len(data) > 4 and google_crc32c.value(data[:-4]) == int.from_bytes(data[-4:], "little")
 

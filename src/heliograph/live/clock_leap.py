@@ -1,4 +1,8 @@
-"""Leaps in time: which clock made them, and what confirms them or takes them back."""
+"""Leaps in time: which clock made them, and what confirms them or takes them back.
+
+A leap is a jump ahead in the dates of events by more than a limit. So far one clock alone has shown it, and that clock
+may be wrong. An event "goes on from before the leap" if it is dated in the jump's gap, so that it contradicts the leap.
+"""
 
 from collections.abc import Iterator
 from math import inf
@@ -40,22 +44,26 @@ class ClockLeap(NamedTuple):
     earlier: "ClockLeap | None" = None
 
     def list_with_earlier(self) -> Iterator["ClockLeap"]:
-        """Yield this leap and then the earlier believed leaps, the newest first."""
+        """Yield this leap and then the leaps before it (`earlier`, all believed), the newest first."""
         leap: ClockLeap | None = self
         while leap is not None:
             yield leap
             leap = leap.earlier
 
     def is_over(self, now: float) -> bool:
-        """Return whether the plant has gone on after the leap, from `since` to `now`, for as long as it leapt."""
+        """Return whether the plant has gone on after the leap for as long as the jump was.
+
+        It went on from the first moment after the leap (`since`) to the newest arrival, the argument `now`. The jump
+        was from `self.now`, the newest arrival before the leap, to `since`.
+        """
         return now - self.since >= self.since - self.now
 
     def as_believed(self) -> "ClockLeap":
-        """Return this leap (a gap in time that only one clock shows) as believed: rows may become final after it.
+        """Return this leap as believed: rows become final by its time although no other clock confirms it.
 
-        If an earlier leap is believed already, the two become one, which begins where the earlier one began and whose
-        far side (`since`) is that of this one. The leap with which a plant begins has no time before it (`now` is -inf)
-        and is not joined. A message that contradicted the leap before (`back`) is forgotten.
+        If an earlier leap is believed already, the two become one, which begins where the earlier one began and ends
+        (`since`) where this one ends. The leap with which a plant begins has no time before it (`now` is -inf) and is
+        not joined. A message that contradicted the leap before (`back`) is forgotten.
         """
         if self.earlier is None or self.earlier.now == -inf:
             return self._replace(believed=True, back=None)
@@ -64,19 +72,24 @@ class ClockLeap(NamedTuple):
     def with_back(self, of: "ClockLeap", back: float | None) -> "ClockLeap":
         """Return this leap and the earlier ones, with `back` set in the leap `of`, which is one of them.
 
-        A leap is a gap in time that only one clock shows. `back` is the time of a message that is dated before the gap
-        though it came after it: the first sign that the clock was wrong; None if there is no such message.
+        `back` is the time of a message that came after the leap but is dated in its gap: the first sign that the clock
+        was wrong. None if there is no such message.
         """
         if self is of:
             return self._replace(back=back)
         return self._replace(earlier=self.earlier and self.earlier.with_back(of, back))
 
     def is_taken_back_by(self, clock: str, time: float, now: float) -> bool:
-        """Return whether a message of `clock` dated `time`, inside the leap's gap, shows that the leap never happened.
+        """Return whether a message that is dated inside the leap's gap shows that the leap never happened.
 
         It does if the leap is not `believed`. Otherwise it does not if it may just be late: if the plant went on after
         the leap, from `since` to `now`, for at least as long as the message is late. Otherwise one message of another
         clock is enough. The leap's own clock must say so twice, the second time shortly after the first (`back`).
+
+        Args:
+            clock: the clock by which the message is dated.
+            time: the message's date.
+            now: the newest arrival after the leap.
         """
         if not self.believed:
             return True
@@ -84,7 +97,8 @@ class ClockLeap(NamedTuple):
             return False  # it may be late
         if clock != self.clock:
             return True
-        # The second message of the leap's own clock is later than the first, but far from the leap's other side.
+        # The leap's own clock: this second message is dated after the first (`back`), and nearer to the first than to
+        # the far side of the gap: time - back < self.time - time.
         return self.back is not None and self.back < time < self.back + self.time - time
 
 
@@ -93,11 +107,12 @@ def find_contradicted_leap(
 ) -> tuple[ClockLeap, float] | None:
     """Return the leap that `time` contradicts, and the newest arrival after that leap; None if there is no such leap.
 
-    In a leap, time goes on by more than `most` at once: from the newest arrival before it (`leap.now`) to its far side
-    (`leap.time`). `time` contradicts the leap if leap.now < time < leap.time - most.
+    In a leap, a jump that one clock alone showed, time goes on by more than `most` at once: from the newest arrival
+    before it (`leap.now`) to its far side (`leap.time`). If it really is `time`, inside this gap, the leap was an
+    error: leap.now < time < leap.time - most.
 
     Args:
-        leap: the newest leap of the chain, None if there is none.
+        leap: the newest leap, which leads to the earlier ones; None if there is none.
         now: the newest arrival.
         time: the time that a clock says.
         most: the longest gap that is no leap.
@@ -105,10 +120,13 @@ def find_contradicted_leap(
     for candidate in leap.list_with_earlier() if leap else ():
         if candidate.now < time < candidate.time - most:
             return candidate, now
-        now = candidate.now
+        now = candidate.now  # of the next, earlier leap: all arrivals after it came before this one
     return None
 
 
 def make_first_leap(time: float, clock: str) -> ClockLeap:
-    """Return the leap with which a plant begins: from no time at all to its first, by this clock."""
+    """Return the leap with which a plant begins, from -inf to the time of its first message, by this clock.
+
+    So an error in the first message's date can be undone like a later one.
+    """
     return ClockLeap(time, time, -inf, {}, clock)

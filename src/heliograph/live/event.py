@@ -52,7 +52,7 @@ class CheckedEvent(NamedTuple):
 
     @property
     def name(self) -> tuple[int, int, float]:
-        """Return the key of the event. It contains the time, since counts start again after a reboot."""
+        """Return what identifies the event: (node, running count, time). Counts alone start again after a reboot."""
         return self.node_index, self.sequence, self.time
 
 
@@ -73,14 +73,20 @@ def check_moment(name: str, value: object) -> float:
 
 
 def check_numbers(name: str, value: ArrayLike, size: int, alone: int | None = None) -> Float[np.ndarray, " numbers"]:
-    """Return a copy of `value` as doubles, NaN where one did not arrive; raise unless there are `size` of them.
+    """Return a copy of a message's values as doubles, NaN where one did not arrive.
 
-    `alone`: another count that is accepted, of values that come without their numbers of lost messages. A single number
-    need not stand in a list.
+    Args:
+        name: what the values are called in errors.
+        value: a list or array of numbers; a single number need not stand in a list.
+        size: how many numbers there have to be.
+        alone: another accepted count: that of values which come without their numbers of lost messages. None if none.
+
+    Raises:
+        ValueError: no such array of numbers, another count of them, or an infinite one.
     """
     expected = "1 number" if size == 1 else f"{size} numbers"
     try:
-        values = np.array(fill_masked(value))
+        values = np.array(fill_masked(value))  # NaN for entries that are masked
         if values.dtype.kind not in "fiu":
             raise ValueError
     except (TypeError, ValueError, OverflowError):

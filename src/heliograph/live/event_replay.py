@@ -65,7 +65,7 @@ def replay_events(
     smoother = None if lag is None else _LaggedSmoother(timeline, lag)
     # The timeline keeps a bounded number of final rows: they are collected before it would drop any.
     finals: list[Record] = []
-    count = 0
+    count = 0  # of events so far; it stays 0 if there are none
     for count, event in enumerate(in_order, 1):
         if smoother is not None:
             smoother.smooth_until(_arrival_of(event))
@@ -93,7 +93,12 @@ class _LaggedSmoother:
     """
 
     def __init__(self, timeline: Timeline, lag: float):
-        """Keep the timeline, and the lag after which each moment is smoothed; `smoothed` collects the estimates."""
+        """Begin without moments.
+
+        Args:
+            timeline: the timeline that gets the events; `smooth_until` advances its time.
+            lag: how long after each moment its estimates are smoothed, by all events until then.
+        """
         self.smoothed: list[tuple[float, Mapping[str, Mapping[str, Estimate]]]] = []
         self._timeline, self._lag = timeline, lag
         self._waiting: list[float] = []  # a heap of moments whose lag has not passed
@@ -111,7 +116,8 @@ class _LaggedSmoother:
         timeline, smoothed = self._timeline, self.smoothed
         while self._waiting and self._waiting[0] + self._lag < arrival:
             moment = heappop(self._waiting)
-            is_done = bool(smoothed) and smoothed[-1][0] == moment  # two nodes measured at this moment
+            newest_smoothed = smoothed[-1][0] if smoothed else None
+            is_done = newest_smoothed == moment  # two nodes measured at this moment
             is_of_wrong_clock = moment > timeline.now  # the clock's leap in time was taken back since
             if is_done or is_of_wrong_clock:
                 continue
@@ -126,7 +132,7 @@ def _arrival_of(event: Event) -> float:
 
 
 def _join_records(records: Sequence[Record]) -> Record:
-    """Return one record of several, one after another in time, with the same nodes and filters."""
+    """Return one record of several that follow one another in time, with the same nodes and filters."""
     estimates = {
         node: {
             filter: _stack_estimates([record.estimates[node][filter] for record in records], np.concatenate)
@@ -140,7 +146,7 @@ def _join_records(records: Sequence[Record]) -> Record:
 
 def _make_record(network: Network, moments: Sequence[tuple[float, Mapping[str, Mapping[str, Estimate]]]]) -> Record:
     """Return the record of several moments; each is (time, estimates at this time by node and filter), in order."""
-    filters_by_node = moments[0][1] if moments else {}
+    filters_by_node = moments[0][1] if moments else {}  # of the first moment: all have the same nodes and filters
     estimates = {
         node: {
             filter: _stack_estimates([estimates_then[node][filter] for _, estimates_then in moments], np.stack)

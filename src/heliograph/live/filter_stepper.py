@@ -6,11 +6,12 @@ leaves implausible measurements out and goes on, and takes many rows at once.
 
 from collections.abc import Sequence
 from functools import cached_property, lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.stages import Wrapped
 from scipy.stats import chi2
 
 from heliograph.engine.choice import make_native_or_none, read_forced_engine
@@ -29,6 +30,7 @@ from heliograph.numerics.trees.program_text import hash_numbers, write_program_t
 from heliograph.numerics.trees.tree_structure import Static, split_structure
 from heliograph.numerics.types import Float, PyTree
 from straightline import Unsupported, compile_one
+from straightline.compiled import SingleRunCode
 
 Leaves = list[np.ndarray]
 PARTS = len(Judgement._fields)
@@ -38,19 +40,25 @@ RARE = 1e-4  # probability with which an honest filter sees what counts as unexp
 class NativeFilterStepper:
     """One filter's step by native code, which reads and writes arrays that stay where they are."""
 
-    def __init__(self, code: Any, numbers: Leaves, state: Leaves):
-        """Start from the leaves `state`; `code` is what `compile_native_step` returns, `numbers` the filter's arrays.
+    def __init__(self, code: SingleRunCode, numbers: Leaves, state: Leaves):
+        """Name the arrays that the compiled code reads and writes at each call, and set the state.
 
-        The code reads and writes the same arrays at each call. They get names here.
+        The code's arguments are (numbers, state, z, u, k). Its results are (judgement, flagged, state after, estimate,
+        next state), of which the next state, the last, is written over the argument "state".
+
+        Args:
+            code: the compiled step, as `compile_native_step` returns it.
+            numbers: the filter's arrays.
+            state: the leaves (arrays) of the filter's state to start from.
         """
         self._code = code.with_new_memory(numbers)
-        # Arguments are (numbers, state, z, u, k), and results (judgement, flagged, state after, estimate, next state).
-        # A state has n leaves.
-        arguments, results, n = self._code.inputs[len(numbers) :], self._code.outputs, len(state)
+        n = len(state)
+        arguments, results = self._code.inputs[len(numbers) :], self._code.outputs
         self._state, (self._z, self._u, self._k) = arguments[:n], arguments[n:]
         self._judged: Float[np.ndarray, " parts"] = results[0]
-        # The last n results are written over the arguments of the state.
-        self._flagged, self._after, self._estimate = results[1], results[2 : 2 + n], results[2 + n : len(results) - n]
+        self._flagged = results[1]
+        self._after = results[2 : 2 + n]
+        self._estimate = results[2 + n : len(results) - n]
         self.set_state(state)
 
     @property
@@ -65,11 +73,11 @@ class NativeFilterStepper:
 
     @property
     def state(self) -> Leaves:
-        """Return copies of the leaves of the filter's state."""
+        """Return copies of the arrays of the filter's state, the leaves of its tree."""
         return [leaf.copy() for leaf in self._state]
 
     def set_state(self, leaves: Sequence[np.ndarray]) -> None:
-        """Set the leaves of the filter's state."""
+        """Set the arrays of the filter's state, given in the order that `state` returns them in."""
         for leaf_of_state, leaf in zip(self._state, leaves, strict=True):
             leaf_of_state[...] = leaf
 
@@ -84,23 +92,29 @@ class NativeFilterStepper:
         return not self._flagged
 
     def accept(self) -> None:
-        """Accept the state after a step that was flagged."""
+        """Take over the state that the newest step led to, although it was refused (flagged)."""
         self.set_state(self._after)
 
     @property
     def estimate(self) -> Leaves:
-        """Return the leaves of the estimate after the step."""
+        """Return the arrays of the estimate after the newest step, the leaves of its tree."""
         return [leaf.copy() for leaf in self._estimate]
 
 
 class XlaFilterStepper:
     """One filter's step by a program of XLA, with its state."""
 
-    def __init__(self, run: Any, numbers: list[jax.Array], state: PyTree):
-        """Start from `state`; `run` is what `compile_xla_step` returns, `numbers` are the filter's arrays."""
+    def __init__(self, run: Wrapped, numbers: list[jax.Array], state: PyTree):
+        """Start from a state of the filter.
+
+        Args:
+            run: the compiled step, as `compile_xla_step` returns it.
+            numbers: the filter's arrays.
+            state: the filter's state, a tree of arrays.
+        """
         self._run, self._numbers = run, numbers
         self._state, tree = jax.tree.flatten(state)
-        self._tree: Any = tree
+        self._tree: PyTree = tree
 
     @property
     def judgement(self) -> Float[np.ndarray, " 4"]:
@@ -114,19 +128,19 @@ class XlaFilterStepper:
 
     @property
     def state(self) -> Leaves:
-        """Return the leaves of the filter's state."""
+        """Return the arrays of the filter's state, the leaves of its tree."""
         return [np.asarray(leaf) for leaf in self._state]
 
     def set_state(self, leaves: Sequence[np.ndarray]) -> None:
-        """Set the leaves of the filter's state."""
+        """Set the arrays of the filter's state, given in the order that `state` returns them in."""
         with jax.enable_x64(True):
             self._state = [jnp.array(leaf) for leaf in leaves]
 
     def step(self, z: np.ndarray, u: np.ndarray, k: int) -> bool:
         """Compute step k from z and u; return whether it was accepted.
 
-        If z or u is implausible or infinite, it is not, and the state stays unchanged. `_run` is the compiled step, and
-        `_tree` the state's structure. `accept` makes the new state the current one.
+        If z or u is implausible or infinite, it is not, and the state stays unchanged (`accept` overrules this). `_run`
+        is the compiled step, `_tree` the state's structure, and `_state` its leaves (arrays).
         """
         with jax.enable_x64(True):
             state = self._tree.unflatten(self._state)
@@ -138,12 +152,12 @@ class XlaFilterStepper:
         return True
 
     def accept(self) -> None:
-        """Accept the state after a step that was flagged."""
+        """Take over the state that the newest step led to, although it was refused (flagged)."""
         self._state = self._after
 
     @property
     def estimate(self) -> Leaves:
-        """Return the leaves of the estimate after the step."""
+        """Return the arrays of the estimate after the newest step, the leaves of its tree."""
         return [np.asarray(leaf) for leaf in self._estimate]
 
 
@@ -162,10 +176,11 @@ def _judge_step(
         u: inputs (inputs,).
         k: step number.
     """
-    filter: AbstractFilter = static.with_arrays(numbers)
+    filter: AbstractFilter = static.with_arrays(numbers)  # the whole filter again
     state_after, estimate, judgement, innovation = filter.judge_step(state, z, u, k)
     # NaN in z means that a component did not arrive. Infinite measurements, and NaN or infinite inputs, are refused.
     has_unusable_numbers = jnp.any(jnp.isinf(z)) | ~jnp.all(jnp.isfinite(u))
+    # The filter's judgement: a reason number above 0 says why z is implausible, and `input` why u is.
     is_refused = has_unusable_numbers | (judgement.reason > 0) | (judgement.input > 0)
     judgement_numbers = jnp.stack(judgement)
     if innovation.weight is not None:
@@ -174,8 +189,11 @@ def _judge_step(
 
 
 @lru_cache
-def compile_xla_step(static: Static) -> Any:
-    """Return a filter's step, compiled by XLA: `_judge_step` as a function of (numbers, state, z, u, k)."""
+def compile_xla_step(static: Static) -> Wrapped:
+    """Return a filter's step, compiled by XLA: `_judge_step` as a function of (numbers, state, z, u, k).
+
+    `static` is the filter without its arrays. Filters that differ in these alone share the compiled step.
+    """
 
     def step(*data: PyTree) -> PyTree:
         """Return what `_judge_step` returns for the data (numbers, state, z, u, k) of the filter `static`."""
@@ -184,8 +202,10 @@ def compile_xla_step(static: Static) -> Any:
     return jax.jit(step, compiler_options=understood())
 
 
-def compile_native_step(static: Static, numbers: Sequence[jax.Array], state: PyTree, data: Sequence[np.ndarray]) -> Any:
-    """Return a filter's step as native code, or None if XLA has to step the filter.
+def compile_native_step(
+    static: Static, numbers: Sequence[jax.Array], state: PyTree, data: Sequence[np.ndarray]
+) -> SingleRunCode | None:
+    """Return a filter's step as native code, or None if the native compiler lacks an operation of it.
 
     Its arguments are (numbers, state, z, u, k), flattened. Its results are those of `_judge_step`, and the next state,
     which is written over the argument. The next state is the old one if the step was flagged (refused).
@@ -197,14 +217,19 @@ def compile_native_step(static: Static, numbers: Sequence[jax.Array], state: PyT
         data: z, u and k; only their shapes count.
     """
     leaves, tree = jax.tree.flatten(state)
+    # All that the code depends on, in a form that can be hashed: `_compile_step` remembers what it compiled.
     shapes = tuple((np.shape(leaf), str(leaf.dtype)) for leaf in (*numbers, *leaves, *data))
     return _compile_step(static, shapes, (len(numbers), len(leaves)), tree, read_forced_engine())
 
 
 @lru_cache
 def _compile_step(
-    static: Static, shapes: tuple[tuple[tuple[int, ...], str], ...], counts: tuple[int, int], tree: Any, engine: str
-) -> Any:
+    static: Static,
+    shapes: tuple[tuple[tuple[int, ...], str], ...],
+    counts: tuple[int, int],
+    tree: PyTree,
+    engine: str,
+) -> SingleRunCode | None:
     """Return a filter's step as native code (see `compile_native_step`); None if XLA has to step the filter.
 
     A live filter makes one step per message, where native code saves the overhead of JAX. None is returned if the
@@ -238,7 +263,7 @@ def _compile_step(
         next_state = [jnp.where(flagged, old, new) for new, old in zip(after, before, strict=True)]
         return judged, flagged, after, estimate, next_state
 
-    def compile_code() -> Any:
+    def compile_code() -> SingleRunCode:
         """Return the code of the step; the next state is written over the arguments of the state."""
         # {number of a result: number of the argument that it is written over}; -1 is the last result.
         in_place = {i - state_count: number_count + i for i in range(state_count)}
@@ -256,7 +281,10 @@ class DecidingSender(NamedTuple):
 
 
 def find_deciding_sender(filter: AbstractFilter) -> DecidingSender | None:
-    """Return the sender whose silence a filter can interpret, or None if there is none."""
+    """Return the sender whose silence a filter can interpret, or None if there is none.
+
+    Such a sender decides by a trigger when to send: that nothing came says something of its measurement.
+    """
     assumed = filter.assumed  # the plant, sensor, channel and trigger that the filter was made for
     if not filter.silence_tells or assumed is None or assumed.trigger is None:
         return None
@@ -270,7 +298,9 @@ class CompiledFilter:
     Attributes:
         horizon: how many steps the filter covers; None for all.
         received, given: how many numbers a measurement and the inputs have.
-        values: how many of the received numbers are values of a sender that decides when to send; 0 if none does.
+        sender: the sender that decides when to send, if the filter can interpret its silence; else None.
+        values: how many of the received numbers are such a sender's values, before its numbers of lost messages; 0
+            without such a sender.
         numbers: the filter's arrays.
         state: structure of its state, to which leaves are put together; `layout`: {path of a leaf: its shape}.
         estimate: structure of the estimate of a step.
@@ -282,22 +312,25 @@ class CompiledFilter:
 
         Filters that differ in numbers alone then share compiled code, which takes the arrays as arguments.
         """
-        # Sizes of z and u, and how many numbers of z are measured values.
         self.filter, self.horizon = filter, filter.horizon
-        self.received, self.given = filter.received, len(filter.inputs)
-        self.values, self.sender = 0, find_deciding_sender(filter)
-        if sender := self.sender:  # behind its values come the numbers of messages lost before each
-            self.values = filter.received - sender.trigger.side_information(sender.outputs)
+        self.received, self.given = filter.received, len(filter.inputs)  # sizes of z and u
+        # Of a sender that decides when to send, z is [measured values, numbers of messages lost before each].
+        self.sender, self.values = find_deciding_sender(filter), 0
+        if sender := self.sender:
+            lost_count = sender.trigger.side_information(sender.outputs)
+            self.values = filter.received - lost_count
         # The filter in double precision, as its arrays and all that is no array; its initial state.
         with jax.enable_x64(True):
             self.numbers, self._static = split_structure(filter)
-            self._start: PyTree = jax.device_put(jax.tree.map(np.asarray, filter.init()))  # no program for each shape
+            # Put on the device as NumPy arrays, since JAX would compile a program for each shape.
+            self._start: PyTree = jax.device_put(jax.tree.map(np.asarray, filter.init()))
         self.state: PyTree = jax.tree.structure(self._start)
         self.layout = {path: part.shape for path, part in split_by_path(self._start).items()}
         self._data = np.zeros(self.received), np.zeros(self.given), np.asarray(0)  # z, u, k: shapes to compile for
+        # The structure of a step's estimate, found from an example whose numbers do not count. `modes` is None, or the
+        # shape of the modes' probabilities, traced without computing anything.
         with jax.enable_x64(True):
             modes = jax.eval_shape(filter.estimate, self._start).modes
-        # An estimate as a step returns it; only its structure counts, so that its numbers stand for any.
         example = JudgedEstimate(
             mean=np.zeros(()),
             covariance=np.zeros(()),
@@ -308,23 +341,27 @@ class CompiledFilter:
             received=0,
         )
         self.estimate: PyTree = jax.tree.structure(example)
-        # The NIS (e' S^-1 e of the innovation) of a filter whose covariance is true is chi-square, with as many degrees
-        # of freedom as numbers arrived. The values that it rarely exceeds, by that number; none if nothing arrived.
+        # If the filter's covariance is true, the NIS (e' S^-1 e of the innovation) is chi-square, with as many degrees
+        # of freedom as numbers arrived. By that number, what it exceeds with probability RARE; inf at 0 numbers.
         self.rare = [np.inf, *(float(chi2.isf(RARE, count)) for count in range(1, self.received + 1))]
 
     def leave_out_refused(
         self, z: Float[np.ndarray, " received"], screened: ScreenedReadings
     ) -> Float[np.ndarray, " received"]:
-        """Return a measurement without the readings that were refused; a sender that decides sent them all the same."""
+        """Return a measurement without the readings that were refused.
+
+        A sender that decides when to send sent a refused reading all the same: its absence must not count as silence,
+        which would tell something of the value.
+        """
         if self.sender is None:
-            return np.asarray(screened.values[0])
+            return np.asarray(screened.values[0])  # of one reading, (1, received)
         return self.sender.trigger.leave_out_refused(z, screened.refused[0] > 0, self.sender.outputs)
 
     def make_stepper(self) -> NativeFilterStepper | XlaFilterStepper:
-        """Return a new stepper whose state is the prior (`_start`).
+        """Return a new stepper of the filter whose state is the initial law (`_start`).
 
-        It uses native code if there is some for the filter, and else XLA. `_static` is the filter without its arrays,
-        and `numbers` are the arrays.
+        It uses native code if the native compiler can compile the filter, and else XLA. `_static` is the filter without
+        its arrays, and `numbers` are the arrays.
         """
         code = compile_native_step(self._static, self.numbers, self._start, self._data)
         if code is None:

@@ -13,15 +13,20 @@ class FinalRows:
     """Outputs of final rows, `size` numbers each, in order of time; beyond `most` rows the oldest parts are dropped."""
 
     def __init__(self, most: int, size: int):
-        """Begin without rows; at least the newest `most` rows are kept, of `size` numbers each."""
-        self.most, self.size, self._parts = most, size, deque[tuple[np.ndarray, np.ndarray]]()
+        """Begin without rows.
+
+        Args:
+            most: so many of the newest rows are kept at least.
+            size: how many numbers a row has.
+        """
+        self.most, self.size = most, size
+        self._parts = deque[tuple[np.ndarray, np.ndarray]]()  # times and outputs of each call of `add`
         self._count = 0  # rows of all parts
 
     def add(self, time: np.ndarray, rows: Float[np.ndarray, "row output"]) -> None:
         """Append rows: their times (row,) and outputs (row, output).
 
-        `_parts` holds these two arrays of each call, the oldest first, and `_count` the number of all rows. The oldest
-        part is dropped while the other parts have at least `most` rows.
+        The rows of the oldest calls are dropped while those of the other calls are at least `most`.
         """
         self._parts.append((time, rows))
         self._count += len(time)
@@ -44,19 +49,22 @@ class GateCounts:
     """Counts of the values that filters left out of rows, by node and filter that weighs what arrives."""
 
     def __init__(self, filters: Iterable[FilterColumns]):
-        """Begin with counts of zero for each filter that weighs; note the columns of its weights in a row."""
+        """Begin with counts of 0 for each filter that weighs values; note the columns of its weights in a row.
+
+        A weight of 0 means that the filter left the value out, as too far from what it expected (a gate).
+        """
         self._columns = {(f.node, f.filter): list(f.weighed.weight) for f in filters if f.weighed is not None}
         self.counts = dict.fromkeys(self._columns, 0)
 
     def count_weights_of_zero(self, rows: Float[np.ndarray, "row output"]) -> None:
-        """Count in the outputs of some rows the weights of 0; what did not arrive has none."""
+        """Add the weights of 0 in some rows' outputs to the counts; a value that did not arrive has weight NaN."""
         for name, columns in self._columns.items():
             self.counts[name] += int(np.count_nonzero(rows[:, columns] == 0))
 
     def pack(self) -> list[tuple[str, str, int]]:
-        """Return the counts as node, filter and number."""
+        """Return the counts as (node, filter, number), as they are saved."""
         return [(*name, count) for name, count in self.counts.items()]
 
     def unpack(self, stored: Sequence[tuple[str, str, int]]) -> None:
-        """Take counts as `pack` returned them, of the filters that are here."""
+        """Restore counts that `pack` returned; those of filters that are not here any more are left out."""
         self.counts |= {(node, name): count for node, name, count in stored if (node, name) in self.counts}

@@ -26,7 +26,10 @@ class Options(NamedTuple):
 
 
 def check_options(options: Options) -> Options:
-    """Return the options converted to floats and integers; raise ValueError if one is out of range."""
+    """Return the options converted to floats and integers; raise ValueError if one is out of range.
+
+    `window` and `ahead` are at least 0, `leap` too, or infinite; `capacity` is at least 1; `step` is above 0 or None.
+    """
     step = None if options.step is None else float(scalar("step", options.step, TINY))
     leap = options.leap if options.leap == np.inf else scalar("leap", options.leap, 0)
     window, ahead = (float(scalar(name, getattr(options, name), 0)) for name in ("window", "ahead"))

@@ -24,12 +24,12 @@ def make_forecast_origin(fleet: Fleet, slot: int | list[int], time: float | np.n
     state_table, program = fleet.state_table, fleet.program
     # Numbers of the row (..., columns); `state_table` knows which columns are inputs, state, outputs and step number.
     row = state_table.table[slot].copy()
-    latest_inputs, several = row[..., state_table.held], row.ndim > 1
+    latest_inputs, several = row[..., state_table.held_inputs], row.ndim > 1
     # In continuous time the time step dt is one of the inputs, number `program.dt`; it is not known ahead, so NaN.
     inputs = latest_inputs if program.dt is None else np.insert(latest_inputs, program.dt, np.nan, axis=-1)
     spacing = float("nan") if program.dt is not None else 1.0
     # A forecast starts with the step after the row's.
-    step = row[..., state_table.at.start].astype(int) + 1
+    step = row[..., state_table.step_number.start].astype(int) + 1
     return Origin(
         model=program.network,
         state=program.step_rows.state.tree(row[..., state_table.state]),
@@ -67,10 +67,12 @@ def judged_estimates_by_name(program: NetworkProgram, outputs: np.ndarray) -> di
     """
     estimates = estimates_by_name(program, outputs)
     for columns in program.filter_columns:
-        tested = columns.judgement or columns.tested  # columns of its squared distance and count
+        # Columns of the squared distance (NIS) and of how many numbers arrived: a filter's judgement, a fusion's test.
+        tested = columns.judgement or columns.tested
         if tested is None:  # it judges nothing: its estimate stands as it is
             continue
         estimate, nis = estimates[columns.node][columns.filter], float(outputs[tested.distance])
+        # Above 0 if the filter did not use what arrived.
         reason = 0.0 if columns.judgement is None else float(outputs[columns.judgement.reason])
         estimates[columns.node][columns.filter] = JudgedEstimate(
             mean=estimate.mean,

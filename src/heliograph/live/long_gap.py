@@ -13,13 +13,13 @@ Step = Callable[[Float[np.ndarray, "row state"], int], Float[np.ndarray, "row st
 """Takes several states, each by itself, through the silent step with this number."""
 
 LONG = 10_000  # steps: a longer gap is not stepped through one by one
-PROBED = 256  # real steps of a probe, by which a jump is proved
-PROBES = 32  # after so many a state neither settles nor moves by an affine map
+PROBED = 256  # steps of a probe: so many are computed one by one, to see how the state moves
+PROBES = 32  # most probes: a state that then neither rests nor moves by an affine map is extrapolated
 TAIL = 4  # steps taken one by one at the end, for what a filter remembers of the step before
-SETTLED = 1e-13  # relative change over a probe: rounding
-AGREES = 1e-8  # relative: what rounding leaves of a probe's differences
-LEAST = 2.0**-40  # of an entry of the map, in units of the movements
-STEADY = 0.01  # relative: a number that moves on by as much as before
+SETTLED = 1e-13  # a relative change of a number over a probe up to this is rounding
+AGREES = 1e-8  # relative error up to which the affine map has to predict a probe
+LEAST = 2.0**-40  # the map's entries are rounded to multiples of this, in units of the numbers' movements
+STEADY = 0.01  # relative difference up to which two changes count as equal: the number goes on at this rate
 
 
 class FactorIndices(NamedTuple):
@@ -96,7 +96,8 @@ def pass_long_gap(step: Step, start: Float[np.ndarray, " state"], state: Float[n
         factors: where a state holds factors L, D of a covariance. These are not affine, but P = L D L' is.
     """
     after = _pass_silent_steps(step, state, at, count, factors)
-    return after if np.isfinite(after[np.isfinite(state)]).all() else start
+    stays_finite = np.isfinite(after[np.isfinite(state)]).all()  # what was finite is so still
+    return after if stays_finite else start
 
 
 def _pass_silent_steps(
@@ -149,9 +150,9 @@ def _pass_silent_steps(
 def _restore_factors(
     state: Float[np.ndarray, " state"], factors: Sequence[FactorIndices]
 ) -> Float[np.ndarray, " state"]:
-    """Return one state with factors in place of covariances."""
-    alone: Float[np.ndarray, " state"] = convert_to_factors(state[None], factors)[0]
-    return alone
+    """Return one state with factors L and D in place of covariances L D L'."""
+    with_factors: Float[np.ndarray, " state"] = convert_to_factors(state[None], factors)[0]  # of several, here of one
+    return with_factors
 
 
 def _extrapolate_state(passed: Sequence[Float[np.ndarray, " state"]], count: int) -> Float[np.ndarray, " state"]:
@@ -161,7 +162,7 @@ def _extrapolate_state(passed: Sequence[Float[np.ndarray, " state"]], count: int
     All other numbers stay. STEADY is the relative difference up to which two changes count as equal.
     """
     quarter = len(passed) // 4
-    end, middle, begin = (passed[-1 - i * quarter] for i in range(3))
+    end, middle, begin = passed[-1], passed[-1 - quarter], passed[-1 - 2 * quarter]
     with np.errstate(invalid="ignore"):
         last_change, change_before = end - middle, middle - begin
         changes_are_equal = np.abs(last_change - change_before) <= STEADY * np.abs(change_before)
@@ -177,8 +178,8 @@ def _step_through(step: Step, state: Float[np.ndarray, " state"], at: int, count
     states = state[None]
     for k in range(at + 1, at + count + 1):
         states = step(states, k)
-    walked: Float[np.ndarray, " state"] = states[0].copy()
-    return walked
+    stepped: Float[np.ndarray, " state"] = states[0].copy()
+    return stepped
 
 
 def _find_moving(before: Float[np.ndarray, " state"], after: Float[np.ndarray, " state"]) -> np.ndarray:
@@ -213,18 +214,19 @@ def _jump_by_affine_map(step: Step, probe: Sequence[Float[np.ndarray, " state"]]
         return None
     # Measure A and c by differences.
     columns = np.flatnonzero(moving)
-    matrix, moved = _measure_affine_map(step, state, probed - state, columns, at)
-    if not np.isfinite(matrix).all():
+    A, c = _measure_affine_map(step, state, probed - state, columns, at)
+    if not np.isfinite(A).all():
         return None
     # The map has to predict the probe, to AGREES of the movement; rounding of the numbers themselves does not count.
     with np.errstate(over="ignore", invalid="ignore"):
-        expected, movement = _iterate_affine_map(matrix, moved, PROBED), (probed - state)[columns]
+        predicted, movement = _iterate_affine_map(A, c, PROBED), (probed - state)[columns]
         scale = np.abs(movement) + AGREES * np.abs(state)[columns]
-        if not (np.abs(expected - movement) <= AGREES * scale + SETTLED * np.abs(probed)[columns]).all():
+        rounding = SETTLED * np.abs(probed)[columns]
+        if not (np.abs(predicted - movement) <= AGREES * scale + rounding).all():
             return None
-        # Go on by the map from s: jumped = s + d after `count` steps.
+        # Go on by the map from s: s + d after `count` steps.
         jumped = state.copy()
-        jumped[columns] += _iterate_affine_map(matrix, moved, count)
+        jumped[columns] += _iterate_affine_map(A, c, count)
     return jumped
 
 
@@ -240,17 +242,19 @@ def _measure_affine_map(
         columns: numbers of the state that move; A and c are of these alone.
         at: number of the step before.
     """
-    # Over a power of two of about the size of the movement, so that the division is exact, and not less than 2^-20 of
-    # the number itself, so that rounding does not count.
-    size = np.exp2(np.ceil(np.log2(np.maximum(np.abs(movement), np.abs(state) * 2.0**-20)[columns])))
+    # h: by how much each number is changed. A power of two of about the size of the movement, so that the division is
+    # exact, and not less than 2^-20 of the number itself, so that rounding does not count.
+    h = np.exp2(np.ceil(np.log2(np.maximum(np.abs(movement), np.abs(state) * 2.0**-20)[columns])))
     tried = np.repeat(state[None], len(columns) + 1, axis=0)  # s itself, then s with one number changed
-    tried[np.arange(1, len(columns) + 1), columns] += size
+    tried[np.arange(1, len(columns) + 1), columns] += h
     after = step(tried, at + 1)[:, columns]
-    matrix = ((after[1:] - after[0]) / size[:, None]).T
+    g_of_s, g_of_changed = after[0], after[1:]
+    A = ((g_of_changed - g_of_s) / h[:, None]).T  # A_ij = (g_i(s + h_j e_j) - g_i(s)) / h_j
     # Round A to LEAST, in units of the movements: an entry 0 computed as 1e-15 would make a number at rest grow with
     # one that grows for ever.
-    units = size[:, None] / size
-    return np.round(matrix / units / LEAST) * LEAST * units, after[0] - state[columns]
+    units = h[:, None] / h
+    c = g_of_s - state[columns]
+    return np.round(A / units / LEAST) * LEAST * units, c
 
 
 def _iterate_affine_map(A: Float[np.ndarray, "m m"], c: Float[np.ndarray, " m"], count: int) -> Float[np.ndarray, " m"]:

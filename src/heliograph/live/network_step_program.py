@@ -52,7 +52,10 @@ class NetworkProgram:
     """
 
     def __init__(self, network: Network):
-        """Compile the step of a network on rows; raise ValueError if it has no filter."""
+        """Compile the step of a network on rows; raise ValueError if it has no filter.
+
+        A row is what came for one time: the measurements of all nodes, and the plant's inputs.
+        """
         instance("network", network, Network, "a Network")
         self.network, self.claims, self.dt = network, network.claims(), find_time_input(network)
         if not any(self.claims.values()):
@@ -76,7 +79,7 @@ class NetworkProgram:
 
     @cached_property
     def identity(self) -> Identity:
-        """Return the identity of the network and its program, which a saved timeline is compared with."""
+        """Return versions, names and hashes of numbers of the network, by which a saved timeline is recognised."""
         return network_identity(self.network, self.step_rows.program, {})
 
 

@@ -14,7 +14,7 @@ from heliograph.live.clock_leap import ARRIVAL, ClockLeap, find_contradicted_lea
 from heliograph.live.event import INPUTS, CheckedEvent
 from heliograph.live.health.link_counts import LinkCounts
 from heliograph.live.sorted_rows import HeldRow, Key, SortedRows
-from heliograph.live.undoable_changes import Change, RowBeforeLeap, UndoneLeap, WithdrawnEvent
+from heliograph.live.undoable_changes import Change, RowBeforeLeap, RowContent, UndoneLeap, WithdrawnEvent
 
 
 @dataclass
@@ -60,27 +60,28 @@ class PlantState:
     def confirmed(self) -> float:
         """Return the time by which rows become final: the newest arrival, or that before a leap in doubt.
 
-        A leap is a gap in time that one clock alone has shown. It is in doubt until another clock confirms it or it is
-        believed (`ClockLeap`).
+        A leap, a jump in time that one clock alone has shown, is in doubt until another clock confirms it or it is
+        `believed`.
         """
         return self.now if self.leap is None or self.leap.believed else self.leap.now
 
     @property
     def clock(self) -> tuple[float, ClockLeap | None]:
-        """Return the time of the newest arrival, and the leap (gap in time) that led to it, or None."""
+        """Return what later events may set back: the time of the newest arrival, and the leap that led to it."""
         return self.now, self.leap
 
     @clock.setter
     def clock(self, clock: tuple[float, ClockLeap | None]) -> None:
-        """Set the time of the newest arrival, and the leap that led to it, None if there is none."""
+        """Set the time of the newest arrival, and the leap that led to it, as `clock` returned them."""
         self.now, self.leap = clock
 
     def undo_contradicted_leap(
         self, clock: str, time: float, longest_gap: float, agreed: bool, names: Sequence[str]
     ) -> None:
-        """Undo a leap (a gap in time that one clock alone showed) if this event shows that it never happened.
+        """Undo a leap (a jump in time that one clock alone showed) if a new event's date shows that it was an error.
 
-        One message of the leap's own clock is not enough if the leap is believed: it is noted, and a second one counts.
+        That is so if the event is dated in the gap over which the time jumped. One message of the leap's own clock is
+        not enough if the leap is believed: it is noted, and a second one counts.
 
         Args:
             clock: name of the clock's node, or `ARRIVAL`.
@@ -92,8 +93,8 @@ class PlantState:
         found = find_contradicted_leap(self.leap, self.now, time, longest_gap)
         if self.leap is None or found is None:
             return
-        leap, newest = found
-        if agreed or leap.is_taken_back_by(clock, time, newest):
+        leap, newest_arrival = found
+        if agreed or leap.is_taken_back_by(clock, time, newest_arrival):
             self.undo_leap(leap, longest_gap, names)
         # The leap's own clock goes on from before it for the first time: its next message may undo the leap.
         elif clock == leap.clock:
@@ -102,9 +103,9 @@ class PlantState:
     def pass_time(self, clock: str, time: float, now: float, longest_gap: float, agreed: bool) -> None:
         """Advance the plant's time to `now`, the arrival of an event that was used.
 
-        If time goes on by more than `longest_gap` at once and no other clock says the same, this is a leap, perhaps the
-        error of one clock: rows do not become final by it until another clock confirms it, or it is believed because no
-        other clock could confirm it. An event dated after an open leap may confirm it.
+        A jump by more than `longest_gap` at once, where no other clock says the same, is recorded as a leap: it may be
+        the error of one clock. Rows do not become final by it until an event of another clock, dated after the jump,
+        confirms it, or it is believed because no other clock could confirm it.
 
         Args:
             clock: name of the node whose event it is, or `ARRIVAL` if its arrival was given.
@@ -113,8 +114,8 @@ class PlantState:
             longest_gap: longest gap that needs no other clock.
             agreed: whether another clock says the same.
         """
-        leap, newest = self.leap, self.now
-        if agreed:
+        leap, newest_before = self.leap, self.now
+        if agreed:  # two clocks: there is no doubt about the time
             leap = None
         elif leap is not None:
             # An event dated before the leap says nothing of the present, nor does the leap's own message again.
@@ -122,17 +123,20 @@ class PlantState:
                 return
             leap = self._confirm_leap(clock, leap, time, longest_gap)
         # Record a new leap, unless an earlier one is in doubt: then this event only lies behind that one.
-        if now > newest + longest_gap and not agreed and (leap is None or leap.believed):
+        jumps = now > newest_before + longest_gap
+        if jumps and not agreed and (leap is None or leap.believed):
+            # Per node the time of its newest count and of its newest measurement: they are set back if the leap is.
             moments = {node: (link.at, link.latest) for node, link in self.links.items()}
-            leap = ClockLeap(time=time, since=time, now=newest, moments=moments, clock=clock, earlier=leap)
-        self.now, self.leap = max(newest, now), leap
+            leap = ClockLeap(time=time, since=time, now=newest_before, moments=moments, clock=clock, earlier=leap)
+        self.now, self.leap = max(newest_before, now), leap
 
     def _confirm_leap(self, clock: str, leap: ClockLeap, time: float, longest_gap: float) -> ClockLeap | None:
-        """Return the leap after an event of `clock` behind its gap; None, or earlier leaps, if it is confirmed.
+        """Return what is left of a leap once an event of `clock` was dated after its jump.
 
-        Another clock confirms the leap at once. The clock that made it confirms it when the plant has gone on for as
-        long as the gap (`is_over`). Before that, a second message of it makes the leap believed if no node that was
-        heard shortly before the gap could confirm it. Inputs have no clock; ARRIVAL is the clock of arrivals.
+        Another clock confirms the leap at once: None is left. The clock that made it confirms it when the plant has
+        gone on for as long as the jump was (`is_over`): the earlier leaps are left. Before that, a second message of
+        this clock makes the leap believed, unless a node that was heard shortly before the jump could still confirm it.
+        Inputs have no clock; ARRIVAL is the clock of arrivals.
         """
         if clock != leap.clock:
             return None
@@ -144,19 +148,21 @@ class PlantState:
         return leap.as_believed()
 
     def undo_leap(self, leap: ClockLeap, longest_gap: float, names: Sequence[str]) -> bool:
-        """Go back to before a leap in time: its rows go with the next finalisation, and time is what it was.
+        """Go back to before a leap, a jump in time that one clock showed in error: drop its rows, and set time back.
 
-        Returns False, and changes nothing, if the row before the leap, a gap in time by one clock, is no longer known.
+        The slots of the rows are freed at the next finalisation. Returns False, and changes nothing, if no row from
+        before the leap is known any more.
 
         Args:
-            leap: the leap, or an earlier one that it follows.
-            longest_gap: longest gap that is no leap: rows from so long before its far side on are of the leap.
+            leap: the newest leap, or an earlier one.
+            longest_gap: longest jump that is no leap: rows from so long before the leap's far side on are of the leap.
             names: names of the nodes in their order, then that of the inputs.
         """
-        held, first_after = self.rows.held, self.rows.first_from(leap.time - longest_gap)
+        held = self.rows.held
+        first_after = self.rows.first_from(leap.time - longest_gap)  # index of the first row of the leap
         # If all rows held are of the leap, only the row kept from before it is left.
-        all_after = first_after == 0
-        if all_after and self.row_before_leap is None:
+        all_after, row_before_leap = first_after == 0, self.row_before_leap
+        if all_after and row_before_leap is None:
             return False
         # The first row held is the base, whose events are final: they stay counted as used.
         not_final = held[max(first_after, 1) :]
@@ -166,14 +172,14 @@ class PlantState:
         self.undone_leaps.append(
             UndoneLeap(
                 held=held,
-                row_before_leap=self.row_before_leap,
+                row_before_leap=row_before_leap,
                 changes=len(self.changes),
                 removed_rows=removed_rows,
                 rows=not_final,
             )
         )
-        if all_after and self.row_before_leap is not None:
-            self.rows.replace_rows([self.row_before_leap.row])  # the base again
+        if all_after and row_before_leap is not None:
+            self.rows.replace_rows([row_before_leap.row])  # later rows are stepped from it again
             self.row_before_leap = None
         else:
             self.rows.replace_rows(held[:first_after])
@@ -184,26 +190,33 @@ class PlantState:
         return True
 
     def _count_withdrawn(self, rows: Sequence[HeldRow], leap: ClockLeap, names: Sequence[str]) -> None:
-        """Count the events in the rows of an undone leap as withdrawn, not used, in the counts of their nodes.
+        """Count the events in these rows as withdrawn, not used, in the counts of their nodes.
 
-        `names` are those of the nodes in their order, then that of the inputs.
+        Args:
+            rows: the rows of a leap that is undone, since its clock was wrong.
+            leap: the leap, with each node's times from before it.
+            names: names of the nodes in their order, then that of the inputs.
         """
         counts: dict[str, int] = {}
         for row in rows:
-            for node, _running_count, _time in row.events:
+            for node, _running_count, _time in row.events:  # node: its index, -1 for the inputs
                 counts[names[node]] = counts.get(names[node], 0) + 1
         for name, count in counts.items():
             # The times in a node's counts become those from before the leap, `leap.moments`.
             self.link_counts(name).count_withdrawn(count, leap.moments.get(name))
 
     def holds_rows_before(self, leap: ClockLeap, time: float, longest_gap: float) -> bool:
-        """Return whether rows from before a leap are held, and `time` comes after the first of them."""
+        """Return whether rows from before a leap are held, and `time` comes after the first of them.
+
+        Then an event of this time still has its place among them if the leap is undone.
+        """
         return self.rows.first_from(leap.time - longest_gap) > 0 and time > self.rows.keys[0][0]
 
     def take_withdrawn(self) -> tuple[list[WithdrawnEvent], list[int]]:
-        """Return the withdrawn events since the last call, and the slots (table rows) that their rows took.
+        """Return the events withdrawn since the last call, and the slots (lines of the table) of their rows.
 
-        An event is withdrawn if a later message showed that its clock was wrong: its leap (gap in time) was undone.
+        An event is withdrawn, after it had been used, if a later message showed that its clock was wrong: the leap in
+        time that it made was undone.
         """
         leaps, self.undone_leaps = self.undone_leaps, []
         events = [WithdrawnEvent(*name) for leap in leaps for row in leap.rows for name in row.events]
@@ -218,29 +231,31 @@ class PlantState:
             event: a node's measurement, or inputs, checked.
             key: key of its row.
             take_slot: called for the slot of a new row: its index in the table of live states.
-            width: how many numbers a row has before its time.
-            losses: name of the event's node and the column of the number of messages lost before it, where its running
-                count says this; else None.
+            width: how many numbers a row has before its time: measurements of all nodes, and inputs.
+            losses: (name of the event's node, column of a row for how many messages were lost before it) for a sender
+                whose running count says this; else None.
         """
         index, row = self.rows.find_row(key)
         if row is None:
             row = HeldRow(key, take_slot(), width)
             self.rows.keys.insert(index, key)
             self.rows.held.insert(index, row)
-            change: Change = row, None
+            change = Change(row, before=None)
         else:
-            change = row, (row.numbers.copy(), dict(row.events))
+            change = Change(row, before=RowContent(row.numbers.copy(), dict(row.events)))
         self.rows.write_event(row, event)
         if losses is not None:
-            self._write_lost(index, row, event, *losses)
-        self.changes.append(change)  # last: that of the event itself
+            node, column = losses
+            self._write_lost(index, row, event, node, column)  # may also record changes of later rows
+        self.changes.append(change)  # last, since callers take the newest change for the event's own row
         # Rows from `first_changed` on are to be stepped again.
         self.first_changed = index if self.first_changed is None else min(self.first_changed, index)
 
     def _write_lost(self, index: int, row: HeldRow, event: CheckedEvent, node: str, column: int) -> None:
-        """Write how many messages were lost before an event, by the running count, unless the message says it itself.
+        """Write into an event's row how many messages were lost just before it, unless the message says it itself.
 
-        If the node's next event is there already, its number is corrected too.
+        The number follows from the node's running count. An event that came out of order also corrects the number of
+        the node's next event.
 
         Args:
             index: index of the event's row.
@@ -251,44 +266,42 @@ class PlantState:
         """
         if row.numbers[column] == row.numbers[column]:  # not NaN: the message says it
             return
-        newest = self.links[node].newest if node in self.links else -1
-        row.numbers[column], corrected = self.rows.count_lost(index, event, column, newest)
+        newest_count = self.links[node].newest if node in self.links else -1
+        row.numbers[column], corrected = self.rows.count_lost(index, event, column, newest_count)
         for later_row, number in corrected:
-            self.changes.append((later_row, (later_row.numbers.copy(), dict(later_row.events))))
+            self.changes.append(Change(later_row, RowContent(later_row.numbers.copy(), dict(later_row.events))))
             later_row.numbers[column] = number
 
     def undo_changes(self) -> list[int]:
-        """Undo all changes since the last finalisation, as if the batch had not come; return the slots that are free.
+        """Undo all changes since the last finalisation, as if their events had not come; return the slots set free.
 
-        Changes are events that were added to rows (`changes`), and rows that were removed with an undone leap, a gap in
-        time by one clock (`undone_leaps`). A slot is a row of the table of estimates. The base, the first held row, is
-        final and never changes. Rows from `first_changed` on have to be stepped again.
+        There are two kinds of changes: an event was added to a row (`changes`), or rows were removed because a jump of
+        the time turned out to be a clock's error (`undone_leaps`). They are undone in reverse order. A slot is a row's
+        line in the table of filter states.
         """
-        slots, keys = list[int](), [row.key for row, _ in self.changes]
-        # Backwards: undo the changes that came after a leap was undone, and then bring the leap's rows back.
-        for leap in reversed(self.undone_leaps):
-            slots += self._undo_since(leap.changes)
-            self.rows.replace_rows(leap.held)
-            self.row_before_leap = leap.row_before_leap
-        slots += self._undo_since(0)
+        changed_keys = [row.key for row, _ in self.changes]
+        freed = list[int]()
+        for undone in reversed(self.undone_leaps):
+            freed += self._undo_since(undone.changes)  # the events that came after the rows were removed
+            self.rows.replace_rows(undone.held)  # the rows from before they were removed
+            self.row_before_leap = undone.row_before_leap
+        freed += self._undo_since(0)
         self.undone_leaps = []
-        # Step again from the first row that was changed, which is never the base.
-        index = max(min(map(self.rows.find_index, keys), default=len(self.rows.held)), 1)
+        # Step again from the first row that was changed: never row 0, which is final.
+        first = min(map(self.rows.find_index, changed_keys), default=len(self.rows.held))
+        index = max(first, 1)
         self.first_changed = index if index < len(self.rows.held) else None
-        return slots
+        return freed
 
     def _undo_since(self, count: int) -> list[int]:
-        """Undo the changes after the first `count`, newest first; return the slots that are free again.
-
-        A change is a pair of a row, and its numbers and events before; these are None if the row was new.
-        """
+        """Undo the changes after the first `count`, newest first; return the slots that are free again."""
         slots = []
         for row, before in reversed(self.changes[count:]):
             if before is None:  # the row was new
                 self.rows.remove_row(self.rows.find_index(row.key))
                 slots.append(row.slot)
             else:
-                row.numbers, row.events = before
+                row.numbers, row.events = before.numbers, before.events
         del self.changes[count:]
         return slots
 
@@ -309,15 +322,15 @@ class PlantState:
         return chain
 
     def finalise_rows(self, watermark: float, longest_gap: float) -> tuple[list[HeldRow], list[int]]:
-        """Make rows before the watermark final; return them and the slots (table rows) that are no longer needed.
+        """Make rows before the watermark final; return them and the slots (lines of the table) that are set free.
 
-        Later rows are stepped from the newest final row, the base. If a leap (a gap in time of more than `longest_gap`
-        by one clock) may still be undone, the newest row before it is kept too. Rows that become final early, for lack
-        of room, are counted in `forced`.
+        Later rows are stepped from the newest final row, the base, which stays. If a leap (a jump in time of more than
+        `longest_gap` by one clock) may still be undone, the newest row before it is kept too. Rows that become final
+        early, for lack of room, are counted in `forced`.
         """
-        self.changes = []
+        self.changes = []  # from here on they cannot be undone
         base, forced = self.rows.find_base(watermark)
-        if not base:  # the base stays what it is: no row becomes final
+        if not base:  # index 0, the base of before: no row becomes final
             return [], self._free_kept_row([], longest_gap)
         self.forced += forced
         final, left = self.rows.move_base(base)
@@ -326,17 +339,19 @@ class PlantState:
     def _free_kept_row(self, left: list[HeldRow], longest_gap: float) -> list[int]:
         """Choose the row to keep in case a leap is undone; return the slots of all other rows that are not held.
 
-        A leap is a gap in time of more than `longest_gap` that one clock alone showed. As long as it may be undone, the
-        newest row before its gap is kept in `row_before_leap`: the plant then goes on from there. `left`: rows that are
-        not held any more, in order of time.
+        A leap is a jump in time of more than `longest_gap` that one clock alone showed. As long as it may be undone,
+        the newest row before it is kept in `row_before_leap`: the plant then goes on from there.
+
+        Args:
+            left: rows that are not held any more, in order of time.
+            longest_gap: longest jump that is no leap.
         """
         # The oldest leap that may be undone. That with which the plant began has no row before it.
         leaps = [] if self.leap is None else [leap for leap in self.leap.list_with_earlier() if leap.now > -inf]
         leap = leaps[-1] if leaps else None
-        if self.row_before_leap is not None and (
-            leap is None or leap.now != self.row_before_leap.now
-        ):  # it was of another leap
-            left, self.row_before_leap = [*left, self.row_before_leap.row], None
+        kept = self.row_before_leap
+        if kept is not None and (leap is None or leap.now != kept.now):  # it was kept for another leap
+            left, self.row_before_leap = [*left, kept.row], None
         if leap is not None and self.row_before_leap is None:
             far_side = leap.time - longest_gap  # rows from then on are after the leap
             rows_before_leap = [row for row in left if row.key[0] < far_side]

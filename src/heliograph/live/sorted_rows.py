@@ -27,9 +27,12 @@ class HeldRow:
     __slots__ = "events", "key", "numbers", "slot"
 
     def __init__(self, key: Key, slot: int, size: int):
-        """Make a row without events, with the key (time, index of the node, count).
+        """Make a row without events, whose numbers are `size` NaN and then its time.
 
-        Its numbers are `size` NaN and then its time.
+        Args:
+            key: (time, index of the node, running count), by which rows are sorted.
+            slot: line of the table of filter states that holds the state after this row.
+            size: how many numbers a row has before its time.
         """
         self.key, self.slot = key, slot
         self.numbers = [nan] * size
@@ -37,8 +40,8 @@ class HeldRow:
         self.events: dict[tuple[int, int, float], list[float]] = {}
 
     def has_data(self) -> bool:
-        """Return whether the row has an event of a node; its other events are inputs, of index -1."""
-        return bool(self.events) and max(self.events)[0] >= 0
+        """Return whether the row has a measurement of a node; its other events are inputs, whose node index is -1."""
+        return any(node_index >= 0 for node_index, _count, _time in self.events)
 
 
 class SortedRows:
@@ -54,8 +57,11 @@ class SortedRows:
     def __init__(self, base: HeldRow, joint: bool, columns: list[slice], capacity: int):
         """Hold the base (the row whose state all later rows follow from) as the only row.
 
-        `joint`: whether all events of one time form one row. `columns`: columns of each node's numbers in a row, by its
-        index, those of the inputs last. `capacity`: greatest number of rows after the base.
+        Args:
+            base: the base.
+            joint: whether all events of one time form one row.
+            columns: columns of each node's numbers in a row, by its index, those of the inputs last.
+            capacity: greatest number of rows after the base.
         """
         self.held, self.keys = [base], [base.key]
         self.joint, self.columns_by_node, self.capacity = joint, columns, capacity
@@ -65,11 +71,12 @@ class SortedRows:
         self.held, self.keys = rows, [row.key for row in rows]
 
     def make_key(self, event: CheckedEvent) -> Key:
-        """Return the key of the row that an event belongs to."""
+        """Return the key of the row that an event belongs to: its time alone decides if rows are joint."""
         return (event.time, 0, 0) if self.joint else (event.time, event.node_index, event.sequence)
 
     def _find_last_before(self, watermark: float) -> int:
         """Return the index of the newest row older than the watermark; 0 if there is none."""
+        # (t,) comes before every longer key that begins with t.
         return max(bisect_left(self.keys, (watermark,)) - 1, 0)
 
     def first_after(self, time: float) -> int:
@@ -81,15 +88,19 @@ class SortedRows:
         return bisect_left(self.keys, (time,))
 
     def judge_event(self, event: CheckedEvent, key: Key, watermark: float, ahead: float) -> Verdict:
-        """Return the verdict on an event whose row has this key, where rows before the watermark are final.
+        """Return the verdict on an event.
 
-        The base is the newest row that is final. `ahead`: how much later than its arrival an event may be dated.
+        Args:
+            event: the event.
+            key: the key of the row that it belongs to.
+            watermark: rows before this time are final.
+            ahead: how much later than its arrival an event may be dated.
         """
         if event.time > event.arrival + ahead:
             return "future"
         if key > self.keys[-1]:  # as most are: nothing can be said against what is newest
             return "used"
-        base, _ = self.find_base(watermark)
+        base, _ = self.find_base(watermark)  # index of the newest row that is final
         index, row = self.find_row(key)
         values_held = None if row is None else row.events.get(event.name)
         # A final row takes no event. Of the base it is still known which events it has: a copy of one is no late one.
@@ -106,13 +117,15 @@ class SortedRows:
         return "conflict" if would_overwrite else "used"
 
     def holds_values(self, event: CheckedEvent) -> bool:
-        """Return whether the row of an event has all its values, that are not NaN, already."""
+        """Return whether the row of an event already has all those of its values that are not NaN."""
         _, row = self.find_row(self.make_key(event))
-        held = [] if row is None else row.numbers[self.columns_by_node[event.node_index]]
-        return row is not None and all(new != new or new == old for old, new in zip(held, event.values, strict=True))
+        if row is None:
+            return False
+        held = row.numbers[self.columns_by_node[event.node_index]]
+        return all(new != new or new == old for old, new in zip(held, event.values, strict=True))  # NaN != NaN
 
     def find_row(self, key: Key) -> tuple[int, HeldRow | None]:
-        """Return the index of the row with this key, and the row if it exists."""
+        """Return the index of the row with this key, and the row; if there is none, where it would stand, and None."""
         if key > self.keys[-1]:
             return len(self.keys), None
         # Keys have the order of the rows, which is by time first.
@@ -154,7 +167,7 @@ class SortedRows:
             newest: count before the event where the rows show none (older rows are final and gone); -1 if there was
                 none.
         """
-        # (row, running count) of the sender's nearest events before and after this one; None where there is none.
+        # The sender's nearest events before and after this one, as (row, running count); None where there is none.
         before = self._find_event_of(event.node_index, range(index - 1, -1, -1))
         after = self._find_event_of(event.node_index, range(index + 1, len(self.held)))
         count = event.sequence
@@ -164,22 +177,25 @@ class SortedRows:
         elif after is not None:
             row_after, count_after = after
             lost = row_after.numbers[column]
-            newest = count_after - int(lost) - 1 if lost == lost else -1
+            newest = count_after - int(lost) - 1 if lost == lost else -1  # lost is NaN (unequal to itself) if unknown
         number = float(count - newest - 1) if 0 <= newest < count else nan
         if after is None:
             return number, []
         row_after, count_after = after
-        return number, [(row_after, float(count_after - count - 1) if count < count_after else nan)]
+        number_after = float(count_after - count - 1) if count < count_after else nan
+        return number, [(row_after, number_after)]
 
     def _find_event_of(self, node: int, indices: range) -> tuple[HeldRow, int] | None:
-        """Return the first of these rows with an event of `node`, and the event's running count, or None.
+        """Return the first row with an event of a node, and the event's running count; None if there is none.
 
-        An event's name is (node, running count, time measured).
+        Args:
+            node: index of the node.
+            indices: indices of the rows to look at, in this order.
         """
         for i in indices:
-            for name in self.held[i].events:
-                if name[0] == node:
-                    return self.held[i], name[1]
+            for node_of_event, running_count, _time in self.held[i].events:
+                if node_of_event == node:
+                    return self.held[i], running_count
         return None
 
     def find_base(self, watermark: float) -> tuple[int, int]:
@@ -188,9 +204,9 @@ class SortedRows:
         The base is the newest final row, from which later rows are stepped. Rows before the watermark become final. At
         most `capacity` rows may be held after the base.
         """
-        by_time = self._find_last_before(watermark)
-        base = max(by_time, len(self.held) - 1 - self.capacity)
-        return base, base - by_time
+        base_by_time = self._find_last_before(watermark)
+        base = max(base_by_time, len(self.held) - 1 - self.capacity)
+        return base, base - base_by_time
 
     def move_base(self, base: int) -> tuple[list[HeldRow], list[HeldRow]]:
         """Make the row with index `base` the base; return the rows that became final, and those that are dropped.

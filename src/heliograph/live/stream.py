@@ -63,20 +63,13 @@ class Stream:
         invalid: ArrayLike = (),
         stuck: StuckLike = None,
     ):
-        """Start from the filter's initial law: no step is done, and nothing is counted.
-
-        Args:
-            filter: the filter to run.
-            limits: greatest and smallest plausible values of received numbers; what is beyond counts as not arrived.
-            invalid: codes for a missing value.
-            stuck: after how many equal readings in a row one counts as not arrived.
-        """
+        """Start from the filter's initial law: no step is done, and nothing counted. The arguments are the class's."""
         if not isinstance(filter, AbstractFilter):
             raise fail("stream", "a filter", type(filter).__name__)
         # The sensor and the channel that the filter was made for, where it says so.
         self.filter, assumed = filter, filter.assumed
         sensor, channel = (None, None) if assumed is None else (assumed.sensor, assumed.channel)
-        # Rules by which values are refused before the filter, and the number of refused values by reason (received,).
+        # Rules by which values are refused before the filter; by reason, how many were of each component (received,).
         self.limits = make_limits(filter.received, limits, invalid, stuck, sensor, channel)
         self.refused = {reason: np.zeros(filter.received, dtype=np.int64) for reason in COUNTED}
         # Runs of equal readings are watched (for a warning) where no rule refuses them, and where the sender does not
@@ -90,9 +83,10 @@ class Stream:
         self._beyond = 0  # unexpected measurements in a row
         self._remarked = 0  # remarks made of the filter's state
         self._inputs = np.full(len(filter.inputs), np.nan)  # of the newest step
-        # The compiled step, with the state; what to warn of its angles.
-        self._compiled, self._angles = compile_once(filter), WideAngles(filter)
+        # The compiled step, which streams of a filter share, and this stream's own state; angles to warn of.
+        self._compiled = compile_once(filter)
         self._stepper = self._compiled.make_stepper()
+        self._angles = WideAngles(filter)
 
     @property
     def doubt(self) -> str:
@@ -122,7 +116,8 @@ class Stream:
             ValueError: a measurement or inputs of another size, infinite values, an input that is NaN, a step past the
                 end of what varies over time, implausible values; the state stays unchanged.
         """
-        compiled, k, stepper = self._compiled, self.steps, self._stepper
+        compiled, stepper = self._compiled, self._stepper
+        k = self.steps
         z, u = self._convert_sample(measurement, inputs)
         # Values beyond the limits, or repeated for too long, count as not arrived.
         screened = None if self.limits is None else self.limits.screen(z[None], self._repeats)
@@ -154,8 +149,9 @@ class Stream:
     def _convert_sample(self, measurement: ArrayLike, inputs: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Return a measurement (received,) and inputs (inputs,) as doubles, or raise ValueError.
 
-        Arrays of doubles of the right size pass at once. Everything else is checked and converted. A measurement is
-        also checked if there are limits.
+        Arrays of doubles of the right size pass without a check, for speed: the compiled step refuses what is not
+        finite. Everything else is checked and converted; so is a measurement if there are limits, which look at it
+        before the step does.
         """
         z, u = _as_doubles(measurement, self._compiled.received), _as_doubles(inputs, self._compiled.given)
         if z is None or self.limits is not None:
@@ -228,8 +224,10 @@ class Stream:
 
     def _describe_angles(self, z: np.ndarray, k: int) -> list[str]:
         """Return lines on angles known less well than the filter can use, and on received ones in degrees, once."""
-        wide = self._angles.said_of(np.diagonal(self._stepper.estimate[1])[None])
-        return [f"step {k}: {line}" for _, line in (*wide, *self._angles.doubt_unit(z[None]))]
+        _mean, covariance, *_ = self._stepper.estimate
+        wide = self._angles.said_of(np.diagonal(covariance)[None])  # of several states' variances, here of one
+        in_degrees = self._angles.doubt_unit(z[None])
+        return [f"step {k}: {line}" for _, line in (*wide, *in_degrees)]
 
     def _count_unexpected(self, beyond: bool) -> list[str]:
         """Count unexpected measurements in a row (`beyond`: this was one); return a line at the BEYOND-th."""
@@ -239,8 +237,8 @@ class Stream:
     def _refuse_or_accept(self, z: np.ndarray, u: np.ndarray) -> None:
         """Raise ValueError if the step's inputs u or measurement z are implausible; else accept the flagged step.
 
-        A step was flagged as implausible. It is accepted where inputs of zero would be implausible too: then only the
-        filter is to blame. The stepper still has the state before the step.
+        The stepper has refused the step as implausible, and still has the state before it. Inputs are to blame unless
+        inputs of zero would be implausible too: then the filter is, and the step is accepted.
         """
         # A step is also flagged for infinite measurements and inputs that are no numbers: these checks raise.
         self.filter.check_measurement(z)
@@ -249,23 +247,24 @@ class Stream:
         judgement = Judgement(*stepper.judgement.tolist())
         if len(u) and (why := Judgement.why_inputs(stepper.judgement[None])):
             check_inputs(self.filter.inputs, u[None], self.filter, self.steps)
-            # Try inputs of zero without a measurement, and take the step back.
-            state = stepper.state
-            stepper.step(np.full(len(z), np.nan), np.zeros(len(u)), self.steps)
-            why_zeros = Judgement.why_inputs(stepper.judgement[None])
-            stepper.set_state(state)
-            if not why_zeros:
-                raise fail(
-                    f"inputs of step {self.steps}",
-                    "plausible ones",
-                    f"{u.tolist()}: {why}{self._name_faulty_function(u)}",
-                )
+            if self._are_zero_inputs_plausible():
+                got = f"{u.tolist()}: {why}{self._name_faulty_function(u)}"
+                raise fail(f"inputs of step {self.steps}", "plausible ones", got)
         if judgement.reason > 0:
             why = Judgement.describe(float(judgement.reason), float(judgement.distance)) + self._name_faulty_function(u)
             raise fail(f"measurement of step {self.steps}", "a plausible one", f"{z.tolist()}: {why}")
         # Step anew, since zeros may have been tried in between, and accept.
         stepper.step(z, u, self.steps)
         stepper.accept()
+
+    def _are_zero_inputs_plausible(self) -> bool:
+        """Return whether inputs of zero, without a measurement, are plausible in this step; the state stays."""
+        stepper = self._stepper
+        state_before = stepper.state
+        stepper.step(np.full(self.filter.received, np.nan), np.zeros(len(self.filter.inputs)), self.steps)
+        why_implausible = Judgement.why_inputs(stepper.judgement[None])
+        stepper.set_state(state_before)
+        return not why_implausible
 
     def _name_faulty_function(self, u: np.ndarray) -> str:
         """Return "; " and the function of the filter's model that is not finite for inputs u, or "" if none is."""

@@ -17,10 +17,11 @@ from heliograph.live.health.link_counts import LinkCounts
 from heliograph.live.health.sender_status import SenderStatus
 from heliograph.live.network_step_program import shared_program
 from heliograph.live.sorted_rows import BEFORE, HeldRow
-from heliograph.live.stored.migration import PlantMigration, describe_network
+from heliograph.live.stored.migration import describe_network
 from heliograph.live.stored.network_changes import DESCRIPTION, SAME
 from heliograph.live.stored.plant_codec import pack_plant, unpack_plant
 from heliograph.live.stored.snapshot import check_same_network, pack_snapshot, unpack_snapshot
+from heliograph.live.stored.timeline_migration import carry_over_timeline
 from heliograph.model.checks.refusal_reasons import SCREENED, Reason
 from heliograph.model.estimate import Estimate
 from heliograph.model.forecast_origin import Origin
@@ -74,10 +75,13 @@ class Timeline:
     def __init__(self, network: Network, window: float, start: float = 0.0, ahead: float = 0.0, capacity: int = 1000):
         """Begin with the initial laws of a network's filters, and no event.
 
-        `window`: how late an event may be; `start`: of continuous time; `ahead`: how much later than its arrival an
-        event may be dated; `capacity`: most rows held, not final yet. Times are in steps or in the unit of dt.
+        Args:
+            network: the network whose filters run.
+            window: how late an event may be, in steps or in the unit of dt.
+            start: start of continuous time.
+            ahead: how much later than its arrival an event may be dated.
+            capacity: greatest number of rows held that are not final yet.
         """
-        # The arguments, checked.
         self.network = instance("network", network, Network, "a Network")
         self.window, self.ahead = float(scalar("window", window, 0)), float(scalar("ahead", ahead, 0))
         start, self.capacity = float(scalar("start", start)), check_count("capacity", capacity)
@@ -90,15 +94,26 @@ class Timeline:
         # Such a plant is integrated by steps that depend on where a prediction in between stops.
         if what := self._program.uneven:
             warnings.warn(f"timeline: predictions depend on when others are asked for: {what}", stacklevel=2)
-        # A fleet of one plant, and a slot (row of its table of states) to predict into.
+        self._start_fleet_and_watches(start)
+
+    def _start_fleet_and_watches(self, start: float) -> None:
+        """Make the fleet of one plant that steps the filters, and what judges and counts on top of it.
+
+        `start`: time of the plant's initial law, where time is continuous.
+        """
+        # The rows of events, and the filters' states after each, in a table of which a slot is a line. `_spare` is a
+        # slot of no row, to predict into.
         self._fleet = Fleet(self._program, Options(self.window, self.ahead, capacity=self.capacity), alone=True)
-        self._plant, self._spare = self._fleet.begin_plant("", start, origin=None), self._fleet.state_table.take_slot()
-        # What judges events, and what is warned of: angles, states of filters, readings that repeat.
+        self._plant = self._fleet.begin_plant("", start, origin=None)
+        self._spare = self._fleet.state_table.take_slot()
+        # Reads whether filters found an event implausible; why the last one of each node was.
         self._judges = JudgementReader(self._fleet)
         self.reasons: dict[str, str] = {}
-        self._angles, self._remarks = AngleWatch(self._fleet), RemarkWatch(self._fleet)
+        # Find what to warn of: angles known too badly, remarks of filters on their states, readings that repeat.
+        self._angles = AngleWatch(self._fleet)
+        self._remarks = RemarkWatch(self._fleet)
         self._held = FleetRepeatWatch(self._fleet)
-        # Of final rows: what filters left out, and the outputs that `final` has not returned yet.
+        # Of rows that are final: counts of values that filters left out, and outputs that `final` has not returned yet.
         self._gates = GateCounts(self._program.filter_columns)
         self._finals = FinalRows(2 * self.capacity, self._program.step_rows.outputs.size)
 
@@ -108,6 +123,7 @@ class Timeline:
         return {"network": self.network, "saved": pack_snapshot(head, arrays)}
 
     def __setstate__(self, stored: dict[str, Any]) -> None:
+        """Restore what `__getstate__` returned, with programs compiled anew."""
         vars(self).update(vars(self._resume_from(stored["network"], *unpack_snapshot(stored["saved"]))))
 
     @property
@@ -122,7 +138,7 @@ class Timeline:
 
     @property
     def forced(self) -> int:
-        """Return how many rows became final early, for lack of room."""
+        """Return how many rows became final early, since more than `capacity` would have been held."""
         return self._plant.forced
 
     @property
@@ -131,7 +147,7 @@ class Timeline:
         links = self._plant.links
         return {
             name: {verdict: getattr(links.get(name, LinkCounts()), verdict) for verdict in VERDICTS}
-            for name in self._fleet.sizes
+            for name in self._fleet.layout.sizes
         }
 
     @property
@@ -181,7 +197,7 @@ class Timeline:
         event = screened.event
         verdict, lines = self._fleet.take_event(plant, event, arrival is not None), list[str]()
         if verdict == "used":
-            row, _ = plant.changes[-1]  # the row that holds the event now
+            row, _ = plant.changes[-1]  # the newest change: the row that holds the event now, and what it held before
             why = screened.why if screened.is_empty else self._explain_implausible(event, row)
             if why is not None:
                 # The event is implausible: undo it, as if it had never arrived.
@@ -201,16 +217,16 @@ class Timeline:
     def _explain_implausible(self, event: CheckedEvent, row: HeldRow) -> str | None:
         """Step the rows that an event changed; return why the event is implausible, or None if it is not.
 
-        Inputs are also judged over one unit of time after them.
+        In continuous time inputs hold from their row on, so that they are judged by a prediction over one unit of time
+        after it.
         """
         fleet, plant = self._fleet, self._plant
         fleet.step([plant])
         why = self._judges.find_implausible([CandidateEvent(0, plant, event, row)]).get(0)
         if why is None and event.is_inputs and self._program.dt is not None:
-            after = fleet.state_table.predict_outputs(
-                np.array([row.slot]), np.full((1, self._program.given), np.nan), np.inf
-            )
-            why = self._judges.explain_inputs(after[0])
+            inputs_stay = np.full((1, self._program.given), np.nan)
+            outputs_after = fleet.state_table.predict_outputs(np.array([row.slot]), inputs_stay, last=np.inf)
+            why = self._judges.explain_inputs(outputs_after[0])
         return why
 
     def advance(self, now: float) -> None:
@@ -223,15 +239,23 @@ class Timeline:
 
         Each says what its filter made of what arrived at `now`: `nis`, `received` and `refused` of `JudgedEstimate`.
         """
-        return judged_estimates_by_name(self._program, self._outputs_after(self._slot_now()[0]))
+        slot, _time = self._slot_now()
+        return judged_estimates_by_name(self._program, self._outputs_after(slot))
 
     @property
     def origin(self) -> Origin:
-        """Return the filters' states at `now`, from which `hg.forecast` predicts; late events are taken as before."""
-        return make_forecast_origin(self._fleet, *self._slot_now())
+        """Return the filters' states at `now`, from which `hg.forecast` predicts.
+
+        They are a copy: the timeline itself does not change, and can still take late events.
+        """
+        slot, time = self._slot_now()
+        return make_forecast_origin(self._fleet, slot, time)
 
     def _slot_now(self) -> tuple[int, float]:
-        """Return the table slot of the state at `now` and its time: of a row, or predicted into the `_spare` slot."""
+        """Return the slot (line of the table of states) that holds the state at `now`, and its time.
+
+        It is the newest row's if nothing has to be predicted, else `_spare`, into which it is predicted here.
+        """
         newest, by_steps = self._plant.rows.held[-1], self._program.dt is None
         newest_time, newest_node, _ = newest.key  # the node is BEFORE in the row before all events
         now = np.floor(min(self.now, self._fleet.end_step)) if by_steps else self.now
@@ -261,10 +285,11 @@ class Timeline:
             raise fail("lag", f"a number from 0 to the window, {self.window:g}", lag)
         by_steps, rows = self._program.dt is None, self._plant.rows
         time = np.ceil(min(self.now, self._fleet.end_step) - lag) if by_steps else self.now - lag
-        if time <= rows.keys[0][0] if by_steps else time < rows.keys[0][0]:
+        base_time, *_ = rows.keys[0]  # of the newest row that is final
+        if time <= base_time if by_steps else time < base_time:
             raise fail("lag", "one to a moment after what is final", f"{lag:g}, to {time:.12g}")
-        # Slots of the row before that moment, of the moment itself, and of all later rows. If there is no row at that
-        # moment, a prediction to it in the spare slot takes its place.
+        # Slots of the row before that moment, of the moment itself (index 1), and of all later rows. If there is no row
+        # at that moment, a prediction to it in the spare slot takes its place.
         after = rows.first_after(time)
         has_row = by_steps and rows.keys[after - 1][0] >= time
         slots = [row.slot for row in rows.held[after - (2 if has_row else 1) :]]
@@ -314,47 +339,9 @@ class Timeline:
         head, arrays = unpack_snapshot(data)
         mine, other = shared_program(network).identity, head.get("of", {})
         if accept_changes and mine != other:
-            return cls._resume_from(network, head, cls._carry_over(network, head, arrays))
+            return cls._resume_from(network, head, carry_over_timeline(network, head, arrays))
         check_same_network("snapshot", mine, other, SAME)
         return cls._resume_from(network, head, arrays)
-
-    @classmethod
-    def _carry_over(
-        cls, network: Network, head: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
-    ) -> dict[str, np.ndarray]:
-        """Return the arrays of a snapshot of another network or version as this network would have saved them.
-
-        A snapshot has a plant's live rows, and final rows (which do not change any more) that were not read yet. If the
-        network has changed, states are moved to where it has them now. It warns of each change, and of final rows that
-        cannot be carried over. Raises ValueError where nothing can.
-
-        Args:
-            network: the network as it is now.
-            head: head of the snapshot: its options, and the identity of the network that saved it.
-            arrays: its arrays: "plant", the plant's bytes; "final.time" and "final", rows not yet read.
-        """
-        # Identities of both networks (texts that differ if the networks do), with a description of where states stand.
-        window, ahead, capacity = head["options"]
-        fleet = Fleet(shared_program(network), Options(window, ahead, capacity=capacity), alone=True)
-        mine, other = fleet.program.identity | {DESCRIPTION: describe_network(fleet)}, head["of"]
-        # A version before 0.3.0 did not write where states stand: it is known for the same nodes and filters.
-        if DESCRIPTION not in head:
-            check_same_network("snapshot", mine, other, (*SAME, "nodes", "filters"), accept=True)
-        other = other | {DESCRIPTION: head.get(DESCRIPTION) or describe_network(fleet, covariances=True)}
-        # `migration` translates rows of the other network to rows of this one; it warns of each change.
-        migration = PlantMigration(fleet, mine, lambda line: warnings.warn(f"timeline, {line}", stacklevel=5))
-        migration.begin("snapshot", other)
-        # The plant, which has no name; and the final rows, whose columns are those of the filters.
-        try:
-            plant = np.frombuffer(migration.migrate({"": arrays["plant"].tobytes()})[""], np.uint8)
-        except ValueError as error:
-            raise fail("snapshot", "rows of the filters that are here", f"other ones: {error}") from None
-        time, final = arrays["final.time"], migration.migrate_outputs(arrays["final"])
-        if final is None:
-            said = f"timeline, snapshot: {len(time)} final rows are estimates of other filters, and not carried on"
-            warnings.warn(said, stacklevel=4)
-            time, final = np.zeros(0), np.zeros((0, fleet.state_table.step_rows.outputs.size))
-        return {"plant": plant, "final.time": time, "final": final}
 
     @classmethod
     def _resume_from(cls, network: Network, head: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> "Timeline":
@@ -375,15 +362,15 @@ class Timeline:
         self, node: str, sequence: int, time: float, values: ArrayLike, arrival: float | None
     ) -> CheckedEvent:
         """Return a pushed event as checked numbers; without `arrival` it arrived when measured, or now if later."""
-        sizes, name = self._fleet.sizes, f"event of {node!r}"
+        sizes, name = self._fleet.layout.sizes, f"event of {node!r}"
         if not isinstance(node, str) or node not in sizes:
             raise fail("node of an event", f"one of {', '.join(sizes)}", show_value(node))
         index, size = sizes[node]
         moment = check_moment(f"{name}, time", time)
         self._fleet.check_step(f"{name}, time", moment)
         arrived = max(self._plant.confirmed, moment) if arrival is None else check_moment(f"{name}, arrival", arrival)
-        numbers = check_numbers(name, values, size, self._fleet.count_values_alone(node)).tolist()
-        numbers = self._fleet.append_losses(node, numbers)
+        numbers = check_numbers(name, values, size, self._fleet.layout.count_values_alone(node)).tolist()
+        numbers = self._fleet.layout.append_losses(node, numbers)
         return CheckedEvent(index, check_63_bits(f"{name}, sequence", sequence), moment, numbers, arrived)
 
     def _finalise(self) -> None:

@@ -1,6 +1,6 @@
 """Changes of a plant that can be undone: events added to rows, and leaps in time that were taken back."""
 
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 from heliograph.live.sorted_rows import HeldRow
 
@@ -13,8 +13,18 @@ class WithdrawnEvent(NamedTuple):
     time: float
 
 
-# A row that took an event, with its numbers and events before; None if the row is new.
-Change: TypeAlias = tuple[HeldRow, tuple[list[float], dict[tuple[int, int, float], list[float]]] | None]
+class RowContent(NamedTuple):
+    """What a row holds: its numbers, and its events by (index of the node, running count, time)."""
+
+    numbers: list[float]
+    events: dict[tuple[int, int, float], list[float]]
+
+
+class Change(NamedTuple):
+    """A row that took an event, and what it held before; None if the row is new."""
+
+    row: HeldRow
+    before: RowContent | None
 
 
 class RowBeforeLeap(NamedTuple):
@@ -25,7 +35,7 @@ class RowBeforeLeap(NamedTuple):
 
 
 class UndoneLeap(NamedTuple):
-    """What taking back a leap removed from a plant, so that `PlantState.undo_changes` can restore it.
+    """What undoing a leap in time (a clock's error) removed from a plant, so that `undo_changes` can restore it.
 
     Attributes:
         held: all rows held before.

@@ -2,8 +2,8 @@
 
 from collections import OrderedDict
 from collections.abc import Container, Sequence
-from datetime import UTC, datetime, time
-from math import floor, inf
+from datetime import datetime
+from math import inf
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,8 +16,9 @@ from heliograph.live.health.link_counts import LinkCounts
 from heliograph.live.plant_state import PlantState
 from heliograph.live.undoable_changes import WithdrawnEvent
 from heliograph.numerics.check import InputError
-from heliograph.serving.message import AnyMessage, Read, UnreadMessage, convert_time_to_seconds
+from heliograph.serving.message import AnyMessage, Read, UnreadMessage
 from heliograph.serving.refusals import WHY
+from heliograph.serving.timed_events import EventReader, TimedEvents
 
 
 class MessageOutcome(NamedTuple):
@@ -51,47 +52,31 @@ class PlantBeforeBatch(NamedTuple):
     links: dict[str, tuple[Any, ...]]
 
 
-class TimedEvents(NamedTuple):
-    """The events of a message with times as numbers from the plant's `origin`.
-
-    Attributes:
-        at: when it was measured.
-        arrival: when it arrived.
-        clock: the present by this machine's clock; None where times have no origin to compare with.
-        origin: the date from which times are counted; None where they are numbers.
-        event: its measurement.
-        inputs: its inputs, None if it has none.
-    """
-
-    at: float
-    arrival: float
-    clock: float | None
-    origin: datetime | None
-    event: CheckedEvent
-    inputs: CheckedEvent | None
-
-
 class BatchIntake:
     """Gives the messages of a batch to their plants; `plants` are those in memory, by name."""
 
     def __init__(self, fleet: Fleet, plants: OrderedDict[str, PlantState]):
-        """Prepare to give messages to plants; `plants` holds those in memory by name, and is changed."""
-        self.fleet, self.plants, self._judges = fleet, plants, JudgementReader(fleet)
-        # Reasons of refused events: {(number of the message, whether the event is its inputs): reason}.
+        """Prepare to give messages to plants; there is no batch yet.
+
+        Args:
+            fleet: steps the plants.
+            plants: the plants in memory, by name; those that begin are added, and those that never were are removed.
+        """
+        self.fleet, self.plants = fleet, plants
+        self._events, self._judges = EventReader(fleet), JudgementReader(fleet)
+        # Of the present batch. Why events are refused: {(number of the message, whether its inputs are meant): reason}.
         self._refused: dict[tuple[int, bool], str] = {}
-        # In the present round: plants by name as they were before, and the events they used, which are to be judged.
+        self._anew: dict[str, int] = {}  # plants that began anew: the versions that the store has of them
+        self.replaced: list[tuple[PlantState, list[WithdrawnEvent]]] = []  # the plants before that, with their events
+        # Of the present round in the batch: plants as they were before it, and the events that they used, to be judged.
         self._before: dict[str, PlantBeforeBatch] = {}
         self._taken: list[CandidateEvent] = []
-        self._anew: dict[str, int] = {}  # versions of plants that began anew in this batch
-        self.replaced: list[
-            tuple[PlantState, list[WithdrawnEvent]]
-        ] = []  # plants that were replaced, with their events
 
     def apply_batch(self, messages: Sequence[Read], damaged: Container[str], wall: datetime) -> list[MessageOutcome]:
-        """Give a batch of messages to their plants, but for damaged ones, and step these; return each one's outcome.
+        """Give a batch of messages to their plants, step these, and return the outcome of each message.
 
-        Messages may be refused as implausible (too far from the forecast to be true) only after their plant used them.
-        Afterwards the plants are as if those messages had never arrived.
+        That a message is implausible (too far from the forecast to be true) shows only once its plant has used it. Such
+        messages are refused, and afterwards the plants are as if they had never arrived.
 
         Args:
             messages: the messages, read; one that could not be read says why.
@@ -101,7 +86,7 @@ class BatchIntake:
         # Of this batch: refused events, plants that began anew, and the former plants that these replaced.
         self._refused, self._anew, self.replaced = self._find_implausible_inputs(messages), {}, []
         outcomes = [MessageOutcome()] * len(messages)
-        # One plant after another, so that its memory is near; the messages of a plant in their order. Messages that
+        # Numbers of messages by plant: one plant is served after another, so that its memory is near. Messages that
         # could not be read have no plant, and stand under "".
         numbers_by_plant: dict[str, list[int]] = {}
         for i, message in enumerate(messages):
@@ -140,7 +125,10 @@ class BatchIntake:
     def _take_message(self, number: int, message: Read, wall: datetime) -> MessageOutcome:
         """Give a message to its plant, as far as it was read; return its outcome.
 
-        `number`: the message's number in the batch. `wall`: the time on this machine's clock.
+        Args:
+            number: the message's number in the batch.
+            message: the message, or what could be read of it, or why nothing could.
+            wall: the time by this machine's clock.
         """
         if isinstance(message, str):  # the reason why it could not be read at all
             return MessageOutcome(why=message)
@@ -154,8 +142,9 @@ class BatchIntake:
     def _find_implausible_inputs(self, messages: Sequence[Read]) -> dict[tuple[int, bool], str]:
         """Return {(number of a message, True): reason} for inputs that lead to no valid prediction.
 
-        These are keys of `_refused`; True says that the inputs are meant, not the values. The prediction starts from
-        the plant's state before the batch. A message has inputs beside its values, or only inputs (its node is INPUTS).
+        The keys are those of `_refused`; True says that the message's inputs are meant, not its measurement. The
+        prediction starts from the plant's state before the batch. A message has inputs beside its measurement, or only
+        inputs (its node is INPUTS).
         """
         numbers, plants, inputs = list[int](), list[PlantState | None](), []
         for i, message in enumerate(messages):
@@ -170,37 +159,32 @@ class BatchIntake:
         return {(i, True): why for i, why in zip(numbers, reasons, strict=True) if why}
 
     def _use_message(self, number: int, message: AnyMessage, wall: datetime) -> MessageOutcome:
-        """Give a message to its plant; the outcome has no plant if one would begin with a refused message.
+        """Give a message to its plant, and say whether it is used, or why not.
 
-        A message is one event (a node's values, or the plant's inputs), or both. The outcome says whether it is used,
-        or why not. `number`: number of the message in the batch. `wall`: the time by this machine's clock.
+        A message has a node's measurement, the plant's inputs, or both: each is an event. The outcome has no plant if a
+        plant would begin with a refused message. `number`: the message's in the batch. `wall`: this machine's time.
         """
         plant = self._find_plant(message, wall)
-        timed = self._read_events(message, plant, wall)
-        # Values beyond limits do not count as received; an event of such values only is implausible.
+        timed = self._events.read_events(message, plant, wall)
+        # Values beyond the node's limits count as not received; if none is left, the event is implausible.
         screened = self.fleet.screen_event(message.node, timed.event, plant)
         why, why_inputs = screened.why if screened.is_empty else "", None
         # What an earlier round found implausible, in the event or in the inputs that came with it; most often nothing.
         if self._refused:
             why = self._refused.get((number, timed.event.is_inputs)) or why
             why_inputs = self._refused.get((number, True)) if timed.inputs is not None else None
-        # A new plant begins with a message that is plausible and of a right clock.
         if plant is None:
-            if timed.at > timed.arrival + self.fleet.options.ahead:
-                return MessageOutcome(verdict="future")
-            nothing_is_plausible = why and (timed.inputs is None or why_inputs)
-            if nothing_is_plausible:
-                return MessageOutcome(verdict="implausible", why=why)
-            # Its first moment counts as a leap in time, by one clock that may be wrong: of arrivals, or of the sender.
-            has_arrival = message.arrival is not None
-            leap = make_first_leap(timed.arrival, ARRIVAL) if has_arrival else make_first_leap(timed.at, message.node)
-            plant = self._begin_plant(message.plant, timed.at, timed.origin, leap)
-        plant = self._note_plant_before_batch(plant, timed.at)
+            refusal = self._refuse_as_first(timed, why, why_inputs)
+            if refusal is not None:
+                return refusal
+            plant = self._begin_plant_by_message(message, timed)
+        plant = self._note_plant_before_batch(plant, timed.at)  # so that it can be restored
         # Inputs and measurement are used or refused independently.
-        notes = list[tuple[Verdict, str]]()
         verdict_on_inputs = self._use_inputs(number, plant, message, timed, why_inputs)
         verdict = self._give_to_plant(number, plant, message, screened.event, timed.clock, why)
         self.fleet.count_event(plant, message.node, screened, verdict)
+        # What is said of parts that were left out: the verdict on each, and why.
+        notes = list[tuple[Verdict, str]]()
         # Inputs that share the measurement's verdict need no word of their own, unless they are what is implausible.
         if verdict_on_inputs == "implausible" or verdict_on_inputs not in ("used", "duplicate", verdict):
             notes.append((verdict_on_inputs, f"inputs {message.inputs}: {why_inputs or WHY[verdict_on_inputs]}"))
@@ -210,12 +194,41 @@ class BatchIntake:
         notes = [(verdict_on_part, note + ending) for verdict_on_part, note in notes]
         return MessageOutcome(plant, verdict, "" if verdict != "implausible" else why, notes)
 
+    def _refuse_as_first(self, timed: TimedEvents, why: str, why_inputs: str | None) -> MessageOutcome | None:
+        """Return the refusal of a message with which no plant can begin, or None if one can.
+
+        It must not be dated in the future, since its clock would be wrong, and something in it must be plausible.
+
+        Args:
+            timed: the events of the message.
+            why: why its measurement is implausible; "" where it is not.
+            why_inputs: the same of its inputs; None where they are plausible, or there are none.
+        """
+        if timed.at > timed.arrival + self.fleet.options.ahead:
+            return MessageOutcome(verdict="future")
+        nothing_is_plausible = why and (timed.inputs is None or why_inputs)
+        return MessageOutcome(verdict="implausible", why=why) if nothing_is_plausible else None
+
+    def _begin_plant_by_message(self, message: AnyMessage, timed: TimedEvents) -> PlantState:
+        """Return a new plant that begins with a message.
+
+        Its first moment counts as a leap in time by one clock, which may be wrong: that of arrivals, or the sender's.
+        """
+        has_arrival = message.arrival is not None
+        leap = make_first_leap(timed.arrival, ARRIVAL) if has_arrival else make_first_leap(timed.at, message.node)
+        return self._begin_plant(message.plant, timed.at, timed.origin, leap)
+
     def _use_inputs(
         self, number: int, plant: PlantState, message: AnyMessage, timed: TimedEvents, why_refused: str | None
     ) -> Verdict:
         """Give the inputs beside a measurement to its plant; return the verdict, "used" where there are none.
 
-        `why_refused`: the reason if the inputs are implausible, else None. `timed`: the message's events with times.
+        Args:
+            number: the message's number in the batch.
+            plant: the plant.
+            message: the message.
+            timed: the message's events, with times as numbers.
+            why_refused: the reason if the inputs are known to be implausible, else None.
         """
         if timed.inputs is None:
             return "used"
@@ -225,23 +238,6 @@ class BatchIntake:
         if verdict not in ("used", "duplicate"):
             plant.link_counts(INPUTS).count_verdict(verdict)
         return verdict
-
-    def _read_events(self, message: AnyMessage, plant: PlantState | None, wall: datetime) -> TimedEvents:
-        """Return the events of a message, its measurement and inputs, with times as numbers of its plant."""
-        origin = self._choose_origin(message) if plant is None else plant.origin
-        at = message.time
-        if origin is not None or not isinstance(at, float):
-            at = self._time_as_number(at, origin, message.plant)
-        # Without a time of arrival it arrived when measured, or, if late, when the plant's newest message did.
-        if message.arrival is None:
-            arrival = at if plant is None else max(plant.confirmed, at)
-        else:
-            arrival = self._time_as_number(message.arrival, origin, message.plant)
-        clock = None if origin is None else self._time_as_number(wall, origin, message.plant)
-        event, inputs = self.fleet.convert_message(message.node, message.sequence, at, message.values, arrival), None
-        if message.inputs is not None:
-            inputs = self.fleet.convert_message(INPUTS, message.sequence, at, message.inputs, arrival)
-        return TimedEvents(at=at, arrival=arrival, clock=clock, origin=origin, event=event, inputs=inputs)
 
     def _count_unread(self, unread: UnreadMessage) -> PlantState | None:
         """Count a message that came but cannot be used, and what it is refused for; it is not counted as lost.
@@ -253,7 +249,7 @@ class BatchIntake:
         if plant is None or (node != INPUTS and node not in self.fleet.network.names):
             return None
         try:
-            at = self._time_as_number(message.time, plant.origin, plant.name)
+            at = self._events.time_as_number(message.time, plant.origin, plant.name)
         except InputError:  # a time of another kind
             return None
         link = self._note_plant_before_batch(plant, at).link_counts(node)
@@ -264,9 +260,10 @@ class BatchIntake:
         return plant
 
     def _note_plant_before_batch(self, plant: PlantState, begun: float) -> PlantState:
-        """Return the plant after noting, once in a batch, its state before the batch for `_restore_plant`.
+        """Note a plant's state, so that `_restore_plant` can undo what the round does to it; return the plant.
 
-        A new plant is added. `begun` is the time of its first event.
+        Its first event in a round does this. A new plant is added to the plants in memory; `begun` is the time of its
+        first event.
         """
         if plant.name not in self.plants:
             self.plants[plant.name] = plant
@@ -276,38 +273,33 @@ class BatchIntake:
             self._before[plant.name] = PlantBeforeBatch(known=True, clock=plant.clock, links=links)
         return plant
 
-    def _time_as_number(self, moment: float | datetime, origin: datetime | None, plant: str) -> float:
-        """Convert a time to a number: of a date, seconds from the origin, or the step that is nearest."""
-        at, step = convert_time_to_seconds(moment, origin, plant), self.fleet.options.step
-        return at if origin is None or step is None else floor(at / step + 0.5)
-
     def _find_plant(self, message: AnyMessage, wall: datetime) -> PlantState | None:
         """Return the plant of a message; None if it has to begin, or to begin anew because its first time was wrong.
 
-        The first message of a plant sets its time, by one clock only: a leap (a gap longer than `longest_gap` that a
-        single clock shows, so that the clock may be wrong). It was wrong if this message is dated long before it and
-        the rule of `is_taken_back_by` holds; or if this machine's time (`wall`) agrees with this message while the
-        plant's time is far ahead.
+        The first message of a plant sets its time by one clock only, which may be wrong. It was if this message is
+        dated long before it and `is_taken_back_by` says so; or if this machine's time (`wall`) agrees with this message
+        while the plant's time is far ahead. "Far" is more than `longest_gap`.
         """
-        # The plant as stored, and the longest gap that is believed of one clock.
+        # The plant as stored, and the longest jump in time that is believed of one clock.
         plant, longest_gap = self.plants.get(message.plant), self.fleet.options.leap
         has_other_kind_of_time = plant is not None and isinstance(message.time, datetime) != (plant.origin is not None)
         if plant is None or has_other_kind_of_time:  # such a message is refused later
             return plant
         # Times as numbers since the plant's origin (a date, if its times are dates).
-        at = self._time_as_number(message.time, plant.origin, plant.name)
+        at = self._events.time_as_number(message.time, plant.origin, plant.name)
         # The clock that decides (of arrivals, where an arrival was given, else the sender's), and the time it shows.
         clock, clock_time = message.node, at
         if message.arrival is not None:
-            clock, clock_time = ARRIVAL, self._time_as_number(message.arrival, plant.origin, plant.name)
-        # Does the message contradict the leap with which the plant began (`now` is -inf: nothing came before it)?
+            clock, clock_time = ARRIVAL, self._events.time_as_number(message.arrival, plant.origin, plant.name)
+        # `first`: the jump in time that this message contradicts, if any; `newest`: the newest arrival after that. If
+        # the plant began with it (its `now` is -inf: nothing came before it), all of the plant was wrong.
         first, newest = find_contradicted_leap(plant.leap, plant.now, clock_time, longest_gap) or (None, at)
         began_with_it = first is not None and first.now == -inf and not plant.holds_rows_before(first, at, longest_gap)
         if first is not None and began_with_it and first.is_taken_back_by(clock, clock_time, newest):
             return None
-        # Does the time here agree with the message, and not with the plant?
+        # Does this machine's time agree with the message, and not with the plant?
         if plant.origin is not None:
-            now = self._time_as_number(wall, plant.origin, plant.name)
+            now = self._events.time_as_number(wall, plant.origin, plant.name)
             is_plant_ahead, is_message_right = plant.confirmed > now + longest_gap, abs(at - now) <= longest_gap
             if is_plant_ahead and is_message_right:
                 return None
@@ -319,14 +311,15 @@ class BatchIntake:
         If a plant of this name exists, its clock was wrong: it ends, its events become refusals (`replaced`), and are
         counted as from the future. `leap`: the jump in time, by one clock, with which the plant begins.
         """
-        plant, old = self.fleet.begin_plant(name, at, origin), self.plants.pop(name, None)
+        plant = self.fleet.begin_plant(name, at, origin)
+        old = self.plants.pop(name, None)
         plant.now, plant.leap, plant.version = at, leap, self._anew.get(name, 0)
         if old is not None:
             # The store has the old plant: the new one takes over its version, also if it is restored in this batch.
             plant.version = self._anew[name] = old.version
             events = [WithdrawnEvent(*event) for row in old.rows.held for event in row.events]
             self.replaced.append((old, events))
-            for node_index, sequence, time in events:
+            for node_index, sequence, time in events:  # index -1: the inputs
                 node = INPUTS if node_index < 0 else self.fleet.network.names[node_index]
                 plant.link_counts(node).count("future", sequence, time)
             # Forget the old plant's state before the batch, and those of its events that were taken in this batch.
@@ -344,9 +337,9 @@ class BatchIntake:
         wall: float | None,
         why_implausible: str | None,
     ) -> Verdict:
-        """Let the plant judge an event and return the verdict; note the event as taken if it is used.
+        """Give an event to its plant and return the verdict; if it is used, note it as one to be judged (`_taken`).
 
-        One that is implausible changes nothing, and is called so if nothing else is wrong with it, as by a `Timeline`.
+        One that is known to be implausible changes nothing, and is called so if nothing else is wrong with it.
 
         Args:
             number: number of its message in the batch.
@@ -361,10 +354,10 @@ class BatchIntake:
             key, ahead = plant.rows.make_key(event), self.fleet.options.ahead
             verdict = plant.rows.judge_event(event, key, watermark, ahead)
             return "implausible" if verdict == "used" else verdict
-        is_dated = message.arrival is not None
-        verdict = self.fleet.take_event(plant, event, is_dated, wall, message.node)
+        arrival_known = message.arrival is not None
+        verdict = self.fleet.take_event(plant, event, arrival_known, wall, clock=message.node)
         if verdict == "used":
-            row, _ = plant.changes[-1]  # the row of the plant's history that holds it now
+            row, _ = plant.changes[-1]  # the newest change: the row that holds the event now, and what it held before
             self._taken.append(CandidateEvent(number, plant, event, row))
         return verdict
 
@@ -376,18 +369,6 @@ class BatchIntake:
             plant.links = {node: LinkCounts(*counts) for node, counts in before.links.items()}
         else:
             self.fleet.end_plant(self.plants.pop(name))
-
-    def _choose_origin(self, message: AnyMessage) -> datetime | None:
-        """Return the date from which a new plant's times are counted, or None if its times are numbers.
-
-        In continuous time it is the midnight (UTC) before the plant's first message. If the network counts steps of a
-        known length, it is the time of the first message, which becomes step 0.
-        """
-        if not isinstance(message.time, datetime):
-            return None
-        if self.fleet.program.dt is None:
-            return None if self.fleet.options.step is None else message.time
-        return datetime.combine(message.time.astimezone(UTC).date(), time(), UTC)
 
 
 def find_plant_name(message: Read) -> str | None:

@@ -55,12 +55,16 @@ class CountTotals:
     """
 
     def __init__(self) -> None:
-        """Begin with no counts: the sums by node, and by plant and node the counts that are in the sums."""
+        """Begin with no counts."""
         self.by_node: dict[str, Counter[str]] = {}
+        # {(plant, node): its counts, in the order of FIELDS, as far as the sums contain them}.
         self._seen: dict[tuple[str, str], tuple[int, ...]] = {}
 
     def add_plant(self, plant: str, links: Mapping[str, LinkTotals]) -> None:
-        """Add to `by_node` the changes of a plant's counts (`links`, by node) since they were last added."""
+        """Add what has changed in a plant's counts since they were last added to the sums in `by_node`.
+
+        `plant` is its name, and `links` has the counts of its messages by node.
+        """
         for node, link in links.items():
             counts = tuple(list_counts_of_link(link).values())
             counts_before = self._seen.get((plant, node), (0,) * len(FIELDS))

@@ -19,9 +19,9 @@ class DeviceStatusService:
     """
 
     def __init__(self, service: BatchService, statuses: DeviceStatuses, store: StoreProtocol):
-        """Hold the service, the statuses of its devices (online or offline) and the store, and restore stored ones."""
+        """Restore the stored statuses of the service's devices: online or offline."""
         self._service, self._statuses, self._store = service, statuses, store
-        self._unkept = dict[str, int]()  # statuses that the store does not have yet, as numbers by topic
+        self._unkept = dict[str, int]()  # {topic: status as a number}, of statuses that the store does not have yet
         statuses.restore(store.words())
 
     def unpublished(self) -> list[Output]:

@@ -12,6 +12,7 @@ from heliograph.live.network_step_program import NetworkProgram
 from heliograph.numerics.types import Float
 from heliograph.simulation.rows.output_columns import FilterColumns
 
+# A line begins with its kind, plant and time. The kind comes as text, plant and time come as JSON.
 HEAD = b'{"kind":"%b","plant":%b,"time":%b,"estimates":'
 FIRST = 2**52  # the number of column 0 where a row holds column numbers: no name contains it
 COLUMN = re.compile(rb"(4503599627[0-9]{6})(\.0)?")
@@ -32,25 +33,25 @@ class EstimateWriter:
     def __init__(self, program: NetworkProgram):
         """Make the template of a line with the estimates of all filters of a network's program.
 
-        A template is such a line with numbers of output columns in place of values. `_whole`: columns that are written
-        as whole numbers. A row fits the template if no variance is negative, no filter has a reason not to use what
-        arrived, and all estimates are finite.
+        The template is such a line with gaps in place of numbers. Most rows fit it: no variance is negative, no filter
+        has a reason not to use what arrived, and all estimates are finite. The columns of a row's outputs that decide
+        this are noted here.
         """
+        all_filters = program.filter_columns  # for each filter the columns of its outputs
         n = self._n = len(program.network.states)
         self._nodes: dict[str, list[FilterColumns]] = {}
-        for columns in program.filter_columns:
+        for columns in all_filters:
             self._nodes.setdefault(columns.node, []).append(columns)
-        # Columns of the outputs that decide whether the template fits.
-        claimed = [columns.covariance for columns in program.filter_columns if columns.claim != "none"]
-        self._variances = [begin + i * (n + 1) for begin in claimed for i in range(n)]  # the diagonal, row after row
-        self._reasons = [
-            columns.judgement.reason for columns in program.filter_columns if columns.judgement is not None
-        ]
-        self._finite = [i for columns in program.filter_columns for i in range(columns.mean, columns.mean + n)]
-        self._finite += [
-            i for columns in program.filter_columns for i in range(columns.covariance, columns.covariance + n * n)
-        ]
-        self._finite += [columns.tested.distance for columns in program.filter_columns if columns.tested is not None]
+        # Variances of claimed covariances: the diagonal of (n, n) numbers that stand row after row.
+        claimed = [columns.covariance for columns in all_filters if columns.claim != "none"]
+        self._variances = [begin + i * (n + 1) for begin in claimed for i in range(n)]
+        # Why a filter did not use what arrived; 0 if it did.
+        self._reasons = [columns.judgement.reason for columns in all_filters if columns.judgement is not None]
+        # What has to be finite: means, covariances, and the squared distances of the tests.
+        self._finite = [i for columns in all_filters for i in range(columns.mean, columns.mean + n)]
+        self._finite += [i for columns in all_filters for i in range(columns.covariance, columns.covariance + n * n)]
+        self._finite += [columns.tested.distance for columns in all_filters if columns.tested is not None]
+        # The template; by gap the column that fills it; the gaps that are written as whole numbers.
         self._template, self._order, self._whole = self._make_template(program.step_rows.outputs.size)
 
     def _make_template(self, size: int) -> tuple[bytes, list[int], list[int]]:
@@ -86,8 +87,10 @@ class EstimateWriter:
             return []
         # The template fits rows whose numbers are finite, whose variances are not negative, and whose filters used all
         # that had arrived (reason 0). The three lists hold columns of `outputs`.
-        fits = np.isfinite(outputs[:, self._finite]).all(axis=1) & (outputs[:, self._variances] >= 0).all(axis=1)
-        fits &= (outputs[:, self._reasons] <= 0).all(axis=1)
+        is_finite = np.isfinite(outputs[:, self._finite]).all(axis=1)
+        is_sound = (outputs[:, self._variances] >= 0).all(axis=1)
+        is_used = (outputs[:, self._reasons] <= 0).all(axis=1)
+        fits = is_finite & is_sound & is_used
         # The texts of all numbers at once, row after row, in the order in which a line has them.
         gap_count, texts = len(self._order), _write_numbers(outputs[:, self._order].ravel().tolist())
         # By gap of the template, what each row has there: every `gap_count`-th text. Whole numbers have no point.
@@ -96,7 +99,8 @@ class EstimateWriter:
             by_gap[gap] = outputs[:, self._order[gap]].astype(int).tolist()
         # Each line begins with the kind, plant and time of its row; then the template takes the texts of its gaps.
         names = {plant: encode_line(plant) for plant in {plant for plant, _ in rows}}
-        head = [kind] * len(rows), [names[plant] for plant, _ in rows], _write_numbers([moment for _, moment in rows])
+        times = _write_numbers([time for _, time in rows])
+        head = [kind] * len(rows), [names[plant] for plant, _ in rows], times
         lines = [self._template % of_row for of_row in zip(*head, *by_gap, strict=True)]
         # Rows that the template does not fit are written anew, filter by filter.
         for i in np.flatnonzero(~fits).tolist():
@@ -123,9 +127,10 @@ class EstimateWriter:
         n, begin = self._n, columns.covariance
         mean, covariance = outputs[columns.mean : columns.mean + n], outputs[begin : begin + n * n]  # row by row
         # An estimate with NaN, infinity or a negative variance claims nothing.
-        claim, variances = columns.claim, covariance[:: n + 1]
-        if claim != "none" and (not all(map(isfinite, (*mean, *covariance))) or min(variances) < 0):
-            claim = "none"
+        claim, variances = columns.claim, covariance[:: n + 1]  # the diagonal
+        if claim != "none":
+            is_sound = all(map(isfinite, (*mean, *covariance))) and min(variances) >= 0
+            claim = claim if is_sound else "none"
         rows = None if columns.claim == "none" else [covariance[i : i + n] for i in range(0, n * n, n)]
         results: dict[str, object] = {"mean": mean, "covariance": rows, "claim": claim}
         if columns.modes is not None:
@@ -138,18 +143,19 @@ class EstimateWriter:
         If the filter weighs outputs singly, "outputs" has each one's value, variance and weight. If it did not use the
         measurement, "implausible" is the reason. `columns`: where these are among the `outputs` of a row.
         """
-        # A fusion has the nis of all that its nodes received (`tested`), a filter that of its own `judgement`.
+        # A fusion: the nis of all that its nodes received, in the columns `tested` = (distance, number that arrived).
         if columns.tested is not None:
             nis, received = (outputs[column] for column in columns.tested)
             return {"nis": nis, "received": int(received) if isfinite(nis) else 0}
+        # A filter: its own judgement of what it received. A fusion without a test has neither.
         judged = columns.judgement
         if judged is None:
             return {}
         results: dict[str, object] = {}
-        if columns.weighed is not None:
+        if columns.weighed is not None:  # value, variance and weight: each the columns of all received numbers
             parts = columns.weighed._asdict().items()
             results["outputs"] = {name: [outputs[i] for i in indices] for name, indices in parts}
-        if outputs[judged.reason] > 0:
+        if outputs[judged.reason] > 0:  # it did not use the measurement
             why = Judgement.describe(outputs[judged.reason], outputs[judged.distance])
             return results | {"nis": None, "received": 0, "implausible": why}
         return results | {"nis": outputs[judged.distance], "received": int(outputs[judged.arrived])}

@@ -104,18 +104,20 @@ _READER, _FAST = TypeAdapter(Message), msgspec.json.Decoder(NumberedMessage)
 def read_messages(payloads: Sequence[Payload]) -> list[Read]:
     """Return the messages of payloads; of what cannot be read the reason, with node, count and time if it has these.
 
+    A fast decoder is tried first; what it refuses is read again by one that explains. It reads only times that are
+    numbers, so that it is not tried if the time of the first payload is a date.
+
     Args:
-        payloads: the messages; if the time of the first is a date, msgspec is not tried.
+        payloads: lines of JSON, or what was read of them already.
     """
     results = list[Read]()
-    # The fast decoder reads times that are numbers.
     quick = not payloads or not isinstance(payloads[0], bytes) or re.search(rb'"time":\s*"', payloads[0]) is None
     for payload in payloads:
         if not isinstance(payload, bytes):
             results.append(payload)
             continue
         try:
-            if not quick or rb"\u0000" in payload or len(payload) > LONGEST:
+            if not quick or rb"\u0000" in payload or len(payload) > LONGEST:  # the fast one does not refuse NUL
                 raise msgspec.DecodeError
             read = _FAST.decode(payload)
             _refuse_doubled_fields(payload, read)
@@ -126,16 +128,17 @@ def read_messages(payloads: Sequence[Payload]) -> list[Read]:
 
 
 def _read_or_explain(payload: bytes) -> Message | UnreadMessage | str:
-    """Return a message; or why it cannot be read, with what names it (NAMED: plant, node, count, time) if it has these.
+    """Return the message in a payload, or why it cannot be read.
 
-    Of a payload too long only the first LONGEST bytes are looked at.
+    If its plant, node, count and time (NAMED) can be read all the same, they are returned with the reason, so that the
+    message does not count as lost. Of a payload too long only the first LONGEST bytes are looked at.
     """
     try:
         return read_message(payload)
     except InputError as error:
         why = str(error)
     try:
-        fields = json.loads(payload[:LONGEST], object_pairs_hook=tuple)
+        fields = json.loads(payload[:LONGEST], object_pairs_hook=tuple)  # an object as pairs (name, value)
         names = [(name, value) for name, value in fields if name in NAMED] if isinstance(fields, tuple) else []
         if len(dict(names)) < len(names):  # a field twice: nobody knows which of the two names it
             return why
@@ -162,6 +165,7 @@ def read_message(payload: bytes) -> Message:
         _refuse_doubled_fields(payload, read)
         return read
     except ValidationError as error:
+        # Only the first fault is named: by its field, what is expected there (EXPECTED), and what came.
         first = error.errors(include_url=False, include_context=False)[0]
         field = str(first["loc"][0]) if first["loc"] else ""
         if field not in EXPECTED:  # no JSON object, or one with a field more

@@ -26,7 +26,12 @@ class NeighbourMessenger:
     """
 
     def __init__(self, fleet: Fleet, moment: Moment):
-        """Find the node's filter if the network is a single node; `moment` returns a row's time as in messages."""
+        """Find the node whose messages are made, if the network is the program of a single node of a mesh.
+
+        Args:
+            fleet: the plants.
+            moment: returns a row's time as messages have it, from its plant and the number of the time.
+        """
         self.fleet, self._moment = fleet, moment
         nodes = {name: filter for name, filter in fleet.network.fused.items() if isinstance(filter, NodeFilter)}
         # Name and filter of the node; "" and None if the network is no single node, which sends nothing.
@@ -56,22 +61,23 @@ class NeighbourMessenger:
         """Return the rows (steps) whose message to the neighbours became due since rows last became final.
 
         A message is due once its row has the node's measurement, or once there is a later row: the step is then over.
+        The returned rows are due now, and were not due before the plant's recorded changes.
         """
-        assert self._node is not None
-        # `plant.changes`: (row, what it was then), where None stands for a new row. By changed row: whether it had the
-        # node's measurement then.
-        measured_before: dict[int, bool] = {}
-        for row, old in plant.changes:
-            measured_before.setdefault(id(row), old is not None and self._has_measurement(old[1]))
-        new = {id(row) for row, old in plant.changes if old is None}
+        # The first change of a row tells whether it had the node's measurement before all of them.
+        measured_before: dict[int, bool] = {}  # by id of the row
+        new_rows = set[int]()
+        for row, before in plant.changes:
+            events_before = {} if before is None else before.events
+            measured_before.setdefault(id(row), self._has_measurement(events_before))
+            if before is None:
+                new_rows.add(id(row))
         held, due = plant.rows.held, []
-        # The last row that was there before; those ahead of it that were there too were followed, and so due, already.
-        newest_before = max((i for i, row in enumerate(held) if id(row) not in new), default=0)
-        for i, row in enumerate(held[1:], 1):
-            followed_before = id(row) not in new and i < newest_before
-            was_due_before = followed_before or measured_before.get(id(row), self._has_measurement(row.events))
-            is_due = self._has_measurement(row.events) or i + 1 < len(held)
-            if is_due and not was_due_before:
+        index_of_newest_before = max((i for i, row in enumerate(held) if id(row) not in new_rows), default=0)
+        for i, row in enumerate(held[1:], 1):  # row 0 is final
+            is_measured, is_followed = self._has_measurement(row.events), i + 1 < len(held)
+            was_measured = measured_before.get(id(row), is_measured)  # a row without a change is as it was
+            was_followed = id(row) not in new_rows and i < index_of_newest_before
+            if (is_measured or is_followed) and not (was_measured or was_followed):
                 due.append(row)
         return due
 
@@ -82,17 +88,22 @@ class NeighbourMessenger:
         sender, count, time): number 0 is the node itself, greater ones its neighbours, negative ones inputs.
         """
         assert self._node is not None
-        return any(node == 0 or (node > 0 and not self._node.measured[0]) for node, _, _ in events)
+        has_sensor = self._node.measured[0] > 0  # `measured`: how many numbers the node and its neighbours measure
+        return any(node == 0 or (node > 0 and not has_sensor) for node, _, _ in events)
 
     def _make_row_messages(self, plant: PlantState, row: HeldRow) -> list[Output]:
-        """Return a row's message to each neighbour: the estimate and covariance before the row, and its measurement."""
+        """Return a row's message to each neighbour, whose values are [mean, covariance, measurement].
+
+        Mean and covariance are the node's estimate before the row; the covariance stands row by row.
+        """
         assert self._node is not None
         state_table, network = self.fleet.state_table, self.fleet.network
+        # A row's state has the filters of nodes, then the central ones by name, among which the node's is.
         _, central, *_ = state_table.step_rows.state.tree(state_table.table[row.slot, state_table.state])
         mean, covariance = self._node.sent(central[self._name].before)
         measurement = row.numbers[: self._node.measured[0]]
         values = np.concatenate([mean, np.ravel(covariance), measurement]).tolist()
-        time = int(row.key[0])
-        message = {"plant": plant.name, "node": network.names[0], "sequence": time, "values": values}
+        step = int(row.key[0])  # also the running count, as there is one message a step
+        message = {"plant": plant.name, "node": network.names[0], "sequence": step, "values": values}
         body = to_json(message | {"time": self._moment(plant, row.key[0])}, inf_nan_mode="null")
         return [Output(None, plant.name, "message", body, name) for name in self._node.receivers]

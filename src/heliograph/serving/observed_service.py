@@ -88,10 +88,10 @@ class ObservedService:
         return outputs
 
     def published(self, outputs: Sequence[Output]) -> None:
-        """Pass on that outputs were published."""
+        """Tell the service that outputs were published."""
         self.service.published(outputs)
 
     def finish(self, ended: bool) -> list[Output]:
-        """Let the service commit everything."""
+        """Let the service commit everything, and return its last outputs; the page waits meanwhile."""
         with self.watch.lock:
             return self.service.finish(ended)

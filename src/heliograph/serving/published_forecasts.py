@@ -43,10 +43,12 @@ class ForecastPublisher:
     """
 
     def __init__(self, fleet: Fleet, horizons: Spans, thresholds: Thresholds = ()):
-        """Check thresholds and horizons against the network; raise ValueError if they do not fit."""
+        """Check thresholds and horizons against the network; raise ValueError if they do not fit.
+
+        `self.horizons` are how far ahead: in steps, or in the unit of dt if time is continuous.
+        """
         check_threshold_names(fleet.network, thresholds)
         self._thresholds = thresholds
-        # `self.horizons` are in the unit of time: steps, or that of dt if time is continuous.
         self._fleet, self._continuous = fleet, fleet.program.dt is not None
         if isinstance(horizons, int):
             if self._continuous:
@@ -61,7 +63,8 @@ class ForecastPublisher:
     def _convert_horizon(self, horizon: float | np.timedelta64 | np.datetime64) -> float:
         """Return how far ahead a horizon is: in steps, or in the unit of dt where time is continuous.
 
-        Spans of time are seconds there; in steps they have to be a whole number of them.
+        A number is that already. A span of time is taken in seconds if time is continuous; else it has to be a whole
+        number of steps.
         """
         if isinstance(horizon, np.datetime64):
             raise fail("--forecast", "spans of time or steps ahead of each message", str(horizon))
@@ -78,21 +81,21 @@ class ForecastPublisher:
         return count
 
     def make_forecasts(self, rows: Sequence[HeldRow]) -> list[list[Ahead]]:
-        """Return the forecasts from each row, by horizon: its time, how far ahead it is, and what each filter says.
+        """Return for each row its forecasts, one for each horizon, which are published beside the row's estimate.
 
-        The service publishes forecasts beside estimates. A row holds a plant's state after its newest measurement, in a
-        slot (row of the table of live states); the rows of all plants are predicted in one call. A row has no forecasts
-        if its longest horizon is after the last step for which the network is defined. How far ahead a forecast is, is
-        given in seconds if messages have dates, else in the unit of their time.
+        A forecast is (its time, how far ahead it is, {node: {filter: what is published}}). A row holds a plant's state
+        after its newest measurement; the rows of all plants are predicted in one call. A row has no forecasts if its
+        longest horizon is after the last step for which the network is defined.
         """
         results: list[list[Ahead]] = [[] for _ in rows]
-        # A network with varying models ends at `end_step`: no forecast may go beyond it.
+        # A network whose models vary ends at the step `end_step`: no forecast may go beyond it.
         latest_time = np.inf if self._continuous else self._fleet.end_step - max(self.horizons)
         times = [float(row.key[0]) for row in rows]  # a row's key begins with its time
         covered = [i for i, time in enumerate(times) if time <= latest_time]  # numbers of the rows that have forecasts
         if not covered:
             return results
-        # Forecasts by node and filter, each of all covered rows; then what is published of them.
+        # Forecasts by node and filter, each of all covered rows; `bodies` has what is published of them, by node,
+        # filter, row and horizon. A slot is the row's line in the fleet's table of filter states.
         slots = [rows[i].slot for i in covered]
         start = ForecastStart(make_forecast_origin(self._fleet, slots, np.array([times[i] for i in covered])))
         # The inputs of the plants keep their last values ("held") over the horizon.
@@ -113,8 +116,8 @@ class ForecastPublisher:
     def _arrange_by_horizon(self, now: float, bodies: dict[str, dict[str, Bodies]], number: int) -> list[Ahead]:
         """Return the forecasts from row `number` of `bodies`, one for each horizon; `now` is the row's time.
 
-        A forecast is (its time, how far ahead it is, {node: {filter: what is published}}). How far is in seconds, or in
-        the unit of times that are numbers.
+        A forecast is (its time, how far ahead it is, {node: {filter: what is published}}). How far ahead is in seconds
+        if messages have dates, else in the unit of their time.
         """
         unit = 1.0 if self._continuous else self._fleet.options.step or 1.0  # seconds of a step, if they are known
         results: list[Ahead] = []
@@ -160,13 +163,15 @@ class ForecastPublisher:
 
         It is {} if the filter claims no covariance. `node_and_filter`: names of the filter's node and of the filter.
         """
+        if forecast.states.claim == "none":
+            return {}
         outputs = () if forecast.outputs is None else forecast.outputs.names
-        known = () if forecast.states.claim == "none" else (*forecast.states.names, *outputs)
-        passed = tuple(threshold for threshold in self._thresholds if threshold.name in known)
-        return (
-            find_crossing_probabilities(start, node_and_filter, passed, self.horizons, not self._continuous)
-            if passed
-            else {}
+        known = (*forecast.states.names, *outputs)
+        thresholds = tuple(threshold for threshold in self._thresholds if threshold.name in known)
+        if not thresholds:
+            return {}
+        return find_crossing_probabilities(
+            start, node_and_filter, thresholds, self.horizons, whole=not self._continuous
         )
 
 
@@ -177,7 +182,8 @@ def _write_forecasts(forecast: "heliograph.forecasting.Forecast") -> Bodies:
     finite is published as null, with the claim "none".
     """
     states, outputs = forecast.states, forecast.outputs
-    is_claimed = np.isfinite(states.covariance).all(axis=(-2, -1)) & (states.claim != "none")  # (row, horizon)
+    # Arrays by (row, horizon); as lists, they are taken apart row by row and then horizon by horizon.
+    is_claimed = np.isfinite(states.covariance).all(axis=(-2, -1)) & (states.claim != "none")
     numbers = is_claimed.tolist(), states.mean.tolist(), states.covariance.tolist()
     bodies: Bodies = [
         [

@@ -19,7 +19,10 @@ WHY: dict[Verdict, str] = {
 def make_refusal_of_message(message: Read, why: str, detail: str) -> Entry:
     """Return the refusal of a message, to be published, with its node, sequence and time if these were read.
 
-    `why` is the kind of reason, and `detail` the reason in words.
+    Args:
+        message: the message, as far as it was read.
+        why: the kind of reason: a verdict, "malformed" or "damaged".
+        detail: the reason in words.
     """
     if isinstance(message, str):  # nothing was read
         return make_refusal_entry(None, {}, why, detail)
@@ -30,6 +33,13 @@ def make_refusal_of_message(message: Read, why: str, detail: str) -> Entry:
 
 
 def make_refusal_entry(plant: str | None, parts: dict[str, object], why: str, detail: str) -> Entry:
-    """Return the refusal of a message as an entry for the store; `parts`: node, sequence and time, if known."""
+    """Return the refusal of a message as an entry for the store: its plant, its kind and a line of JSON.
+
+    Args:
+        plant: name of the message's plant; None if it is not known.
+        parts: "node", "sequence" and "time" of the message, those that are known; the others become null.
+        why: the kind of reason, published as "reason".
+        detail: the reason in words.
+    """
     results = {"kind": "refused", "plant": plant, "node": None, "sequence": None, "time": None}
     return Entry(plant or "", "refused", encode_line(results | parts | {"reason": why, "detail": detail}))

@@ -73,20 +73,18 @@ class Service:
         forecast: Spans | None = None,
         thresholds: Thresholds = (),
     ):
-        """Begin with no plant in memory; stored ones are loaded from `store` when needed. `say` gets warnings.
-
-        `fleet`: all plants of a network. `every`: seconds until a silent plant is published again. `forecast`: spans.
-        """
+        """Begin with no plant in memory; stored ones are loaded when they are needed. For arguments see the class."""
         instance("fleet", fleet, Fleet, "a Fleet")
         self.fleet, self.store = fleet, store
         self.plants = OrderedDict[str, PlantState]()  # those in memory, in order of their newest message
         # Messages that were malformed, and that were duplicates or late, in all batches; statistics of the last batch.
         self.malformed, self.known, self.last = 0, 0, BatchStatistics()
-        # What takes messages, and what makes outputs: estimates, messages to neighbours, what silence means, forecasts.
-        self._writer, self._intake = EstimateWriter(fleet.program), BatchIntake(fleet, self.plants)
+        # Gives messages to their plants; then what makes outputs: estimates as JSON, messages to neighbours' services,
+        # what silence means, and forecasts.
+        self._intake, self._writer = BatchIntake(fleet, self.plants), EstimateWriter(fleet.program)
         self._exchange, self._silence = NeighbourMessenger(fleet, self._time_in_messages), SilenceWatch(fleet, every)
         self._ahead = None if forecast is None else ForecastPublisher(fleet, forecast, thresholds)
-        # Watches for warnings on plants: `_doubt` says doubts, `_say` the first implausible message, then it is None.
+        # Find doubts on plants, which `_doubt` says. `_say` says the first implausible message, and is then None.
         self._angles, self._remarks, self._held = AngleWatch(fleet), RemarkWatch(fleet), FleetRepeatWatch(fleet)
         self._say, self._doubt = say, say
         self._unsearched = 0  # messages since the last search for garbage
@@ -115,7 +113,7 @@ class Service:
         return outputs
 
     def resume(self) -> None:
-        """Load stored plants, up to ROWS rows, if a sender's silence while the service did not run says something."""
+        """Load stored plants, up to ROWS rows, if senders' silence while the service did not run says something."""
         if (self.fleet.deciding and self.fleet.options.step is not None) or self.fleet.shortest_timeout < inf:
             names = self.store.names()
             for i in range(0, len(names), LARGE):
@@ -125,7 +123,7 @@ class Service:
 
     def _tell_timeouts(self, now: datetime) -> list[Output]:
         """Return provisional estimates of plants in which a sender has newly timed out by now; nothing is committed."""
-        late = self._silence.find_plants_overdue(self.plants.values(), now)
+        late = self._silence.find_plants_overdue(self.plants.values(), now)  # plants, each with the present moment
         self.fleet.pass_silence(late)
         return self._write_provisional([(plant, plant.silence) for plant, _ in late if plant.silence is not None])
 
@@ -138,7 +136,7 @@ class Service:
         if self._exchange.sends:  # a node sends to its neighbours at each step, and needs a message to make the step
             steps = self._make_step_messages(now)
             return self._take_batch(steps) if steps else []
-        # A row is one time's data; it becomes final once older events are refused. Withdrawn events had a wrong clock.
+        # Rows become final by the time that has passed. Events of a clock that turns out wrong are withdrawn.
         due = self._silence.find_plants_due(self.plants.values(), now)  # plants, each with the step that it is by now
         for plant, step in due:
             self.fleet.advance_time(plant, step)
@@ -228,7 +226,7 @@ class Service:
         return self._commit({}, entries, 0)
 
     def _take_messages(self, messages: Sequence[Read], payloads: Sequence[Payload]) -> tuple[list[Output], float]:
-        """Use messages and commit; return the outputs to publish, and the seconds of the commit (storing in one go).
+        """Use messages and commit; return the outputs to publish, and the seconds that the commit took.
 
         `payloads`: what the messages were read from, one each, to show those that were not used.
         """
@@ -236,7 +234,7 @@ class Service:
         touched = {outcome.plant.name: outcome.plant for outcome in outcomes if outcome.plant is not None}
         self._warn_of_doubts(list(touched.values()))
         entries, malformed, known = self._make_entries_on_unused(messages, payloads, outcomes)
-        # A row is final when no later message can change it: its estimates are committed. Others are only published.
+        # Estimates of rows that no later message can change are committed, as entries. Others are only published.
         sent = self._exchange.make_messages(touched.values())
         finalised = self.fleet.finalise_plants(touched.values())
         # Events that were used before a clock turned out wrong, by plant: they are refused after all.
@@ -269,8 +267,8 @@ class Service:
     ) -> tuple[list[Entry], int, int]:
         """Return refusals of messages that were not used, or not wholly; how many were malformed, and how many known.
 
-        The entries tell why a message did not change an estimate. Known messages are duplicates and late ones: they may
-        have been used before a restart. `payloads`: the raw content of each. `outcomes`: its verdict, and the reason.
+        Known messages are duplicates and late ones: they may have been used before a restart. `payloads` has the raw
+        content of each message, and `outcomes` its verdict and the reason.
         """
         entries, malformed, known = list[Entry](), 0, 0
         for message, payload, outcome in zip(messages, payloads, outcomes, strict=True):
@@ -295,7 +293,7 @@ class Service:
     def _make_refusal_entries(self, message: AnyMessage, outcome: MessageOutcome) -> list[Entry]:
         """Return a refusal for a message that was not used, and one for each part of a message that was left out.
 
-        `outcome.notes`: why inputs or values were left out. The first implausible message causes a warning.
+        A part is its inputs or single values, as `outcome.notes` says. The first implausible message causes a warning.
         """
         parts = list(outcome.notes)
         if outcome.verdict is not None and outcome.verdict != "used":
@@ -364,16 +362,16 @@ class Service:
 
     def _write_withdrawn(self, plant: PlantState, events: Iterable[WithdrawnEvent]) -> Iterator[Entry]:
         """Yield a refusal ("future", LEAPT) of each event that was used before its clock turned out to be wrong."""
-        for node, sequence, time in events:
+        for node, sequence, time in events:  # node: its index, -1 for the inputs
             name = INPUTS if node < 0 else self.fleet.network.names[node]
             identity = {"node": name, "sequence": sequence, "time": self._time_in_messages(plant, time)}
             yield make_refusal_entry(plant.name, identity, "future", LEAPT)
 
     def _write_provisional(self, rows: Sequence[tuple[PlantState, HeldRow]]) -> list[Output]:
         """Return outputs with the estimates after these rows, forecasts from them, and the status of their senders."""
-        outputs, held = [], [row for _, row in rows]
+        outputs = []
         self._silence.note_published(rows)
-        forecasts = [None] * len(rows) if self._ahead is None else self._ahead.make_forecasts(held)
+        forecasts = [None] * len(rows) if self._ahead is None else self._ahead.make_forecasts([row for _, row in rows])
         bodies = self._write_estimates(b"provisional", rows)
         for (plant, _), body, horizons in zip(rows, bodies, forecasts, strict=True):
             # `body` is a JSON object as bytes: members are added before its closing brace, body[:-1].
@@ -395,6 +393,6 @@ class Service:
         return self._writer.write_lines(kind, moments, self.fleet.outputs([row.slot for _, row in rows]))
 
     def _time_in_messages(self, plant: PlantState, at: float) -> float | str:
-        """Return the time of a row as messages have it."""
+        """Return the time of a row as messages have it: a number, or an ISO date if times have an origin."""
         unit = self.fleet.options.step or 1.0
         return at if plant.origin is None else (plant.origin + timedelta(seconds=at * unit)).isoformat()

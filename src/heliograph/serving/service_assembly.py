@@ -125,7 +125,7 @@ async def serve_leased_parts(leases: PartLeases, serve: Serve) -> None:
         try:
             while not stop.is_set():
                 await _serve_exactly(parts, leases, serve)
-                with contextlib.suppress(TimeoutError):
+                with contextlib.suppress(TimeoutError):  # renew the leases several times in their term
                     await asyncio.wait_for(stop.wait(), leases.term / 5)
         finally:
             await asyncio.gather(*[part.end() for part in parts.values()])
@@ -170,11 +170,10 @@ def _drop_ended(parts: dict[int, _ServedPart]) -> None:
 async def run_service(settings: ServiceSettings) -> None:
     """Serve until the messages end, or until SIGTERM or SIGINT.
 
-    `settings.parts`: into how many parts the plants are divided, of which this process serves some; None if it serves
-    all plants alone. `wrap` connects a service to the page that shows it.
+    `settings.parts`: into how many parts the plants are divided, of which this process serves some; None for all alone.
     """
     _log_to_stderr()
-    async with _serve_watch_page(settings) as wrap:
+    async with _serve_watch_page(settings) as wrap:  # wrap(service): the same service, shown on the page
         program = await _compile_steps(settings.network)
         if program is None:
             return
@@ -212,7 +211,7 @@ WrapService = Callable[[Service], BatchService]
 
 @asynccontextmanager
 async def _serve_watch_page(settings: ServiceSettings) -> AsyncIterator[WrapService]:
-    """Serve the page for a block, if there is one, and yield what wraps a service so that the page shows it."""
+    """Serve the page, if one is asked for, in a `with` block; yield what wraps a service so that the page shows it."""
     if settings.page is None:
         yield lambda service: service
         return
@@ -228,10 +227,16 @@ async def _serve_watch_page(settings: ServiceSettings) -> AsyncIterator[WrapServ
 
 
 async def _serve_alone(settings: ServiceSettings, program: NetworkProgram, wrap: WrapService) -> None:
-    """Serve all plants in this process, until the messages end or a signal; `wrap` shows the service on the page."""
+    """Serve all plants in this process, until the messages end or a signal stops it.
+
+    Args:
+        settings: settings of the service.
+        program: the network's compiled step.
+        wrap: wraps a service so that the page shows it.
+    """
     stop = asyncio.Event()
-    # The reader of messages that other programs make, where the network's file has sources, which describe them; these
-    # then say how long a step is. A fleet holds and steps the plants.
+    # `reader` reads messages that other programs make, where the network's file has sources, which describe them and
+    # then say how long a step is.
     reader = None if settings.sources is None else Translator(settings.sources, settings.network, settings.others)
     step = settings.options.step if reader is None else reader.sources.step_seconds
     fleet = Fleet(program, settings.options._replace(step=step))
@@ -245,18 +250,16 @@ async def _serve_alone(settings: ServiceSettings, program: NetworkProgram, wrap:
             service.resume()
             transport = _open_transport(settings, reader)
             # Devices may say when they go offline: the last status of each is kept in the store too.
-            shown = (
-                wrap(service)
-                if reader is None
-                else DeviceStatusService(wrap(service), reader.sources.device_statuses, store)
-            )
+            shown = wrap(service)
+            if reader is not None:
+                shown = DeviceStatusService(shown, reader.sources.device_statuses, store)
             await serve_until(stop, WaitingService(shown, stop), transport, _choose_patience(fleet))
         finally:
             store.close()
     # Say which parts of other programs' messages were not used.
     for line in [] if reader is None else reader.left_out():
         _print_to_stderr(line)
-    # A store may have used the same messages in an earlier run: say so, as nothing else shows it.
+    # The same messages may have been used in an earlier run: nothing else shows it.
     if has_plants and service.known:
         anew = f"to begin anew, delete {store.name} or name another --store"
         _print_to_stderr(f"{service.known} messages were known already or came after what was final; {anew}")
@@ -276,7 +279,9 @@ def _choose_patience(fleet: Fleet) -> float | None:
 def _open_transport(settings: ServiceSettings, reader: Translator | None) -> Transport:
     """Return the transport of all plants' messages and outputs: a broker, or standard input and output.
 
-    If `settings.states` is given, single states are published too. `reader` reads messages that sources map.
+    Args:
+        settings: says which broker, if any, and whether each estimated state is published on a topic of its own too.
+        reader: reads messages of other programs, as the sources in the network's file describe them; None without any.
     """
     if settings.broker is None:
         return _add_states(settings, _open_pipe(settings, reader))
@@ -284,7 +289,7 @@ def _open_transport(settings: ServiceSettings, reader: Translator | None) -> Tra
 
 
 def _add_states(settings: ServiceSettings, transport: Transport) -> Transport:
-    """Return a transport that also publishes each state by itself, on MQTT, if `settings.states` asks for it."""
+    """Return a transport that also publishes each estimated state on a topic of its own, if settings ask for it."""
     if settings.states is None:
         return transport
     from heliograph.serving.brokers.state_topics import StatePublishing
@@ -293,7 +298,7 @@ def _add_states(settings: ServiceSettings, transport: Transport) -> Transport:
 
 
 def _open_pipe(settings: ServiceSettings, reads: Translator | None) -> Pipe:
-    """Return the transport from standard input to standard output."""
+    """Return the transport from standard input to standard output; `reads` reads messages of other programs."""
     path = redirected_file(STANDARD_INPUT)
     return Pipe(STANDARD_INPUT, reader=LineReader(settings.network, reads, path, settings.ignore_unknown))
 
@@ -378,7 +383,7 @@ async def _serve_part(
     stop: asyncio.Event,
     checked: "Store",
 ) -> None:
-    """Serve one part of the plants until `stop` is set; `checked` is the store, open before and without damage."""
+    """Serve one part of the plants until `stop` is set; `checked` is the store, which was looked through for damage."""
     from heliograph.serving.storage.store import Store
 
     assert settings.broker is not None  # the settings require one

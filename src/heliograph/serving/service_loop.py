@@ -24,9 +24,10 @@ class StoppableWork:
     """
 
     def __init__(self, stop: asyncio.Event):
-        """Hold the event that ends the work, and make the one thread in which the service is called."""
+        """Make the one thread in which the service is called; `stop` is the event that ends the work."""
         self.stop = stop
-        self._thread, self._stopped_at = ThreadPoolExecutor(1), 0.0
+        self._thread = ThreadPoolExecutor(1)
+        self._stopped_at = 0.0  # by the monotonic clock; 0 before a stop
 
     async def wait_in_time(self, work: "asyncio.Future[T]") -> bool:
         """Wait for work to end, after a stop only for the time that is left; return whether it has ended."""
@@ -96,10 +97,11 @@ async def serve_until(
     """
     ending = StoppableWork(stop)
     try:
+        # First what an earlier run has left; then the messages; at last what the end makes final.
         await _publish_in_time(service, transport, service.unpublished(), ending)
         ended = await _serve_batches(service, transport, ending, patience)
         await _publish_in_time(service, transport, await ending.call(service.finish, ended), ending)
-        await ending.call(service.finish, False)
+        await ending.call(service.finish, False)  # this commit records that the outputs were published
     except AbandonedError:
         LOG.warning("stopped while it computed: the messages that it was taking are not committed, and come again")
     finally:
@@ -109,13 +111,19 @@ async def serve_until(
 async def _serve_batches(
     service: BatchService, transport: Transport, ending: StoppableWork, patience: float | None
 ) -> bool:
-    """Receive, take and publish until a stop or the transport's end; return whether it was the latter."""
+    """Receive, take and publish until a stop or the transport's end; return whether it was the latter.
+
+    Messages are acknowledged once what was made of them is committed, before it is published.
+    """
     stop = ending.stop
     while not stop.is_set():
         # The next messages, or after a while that there are none.
         waiting = asyncio.ensure_future(_await_unless_stopped(stop, transport.receive()))
         try:
-            while not (await asyncio.wait({waiting}, timeout=patience))[0]:
+            while True:
+                done, _pending = await asyncio.wait({waiting}, timeout=patience)
+                if done:
+                    break
                 await _publish_in_time(service, transport, await ending.call(service.take, []), ending)
         finally:
             waiting.cancel()
@@ -144,7 +152,10 @@ async def _publish_in_time(
 
 
 async def _await_unless_stopped(stop: asyncio.Event, waiting: Coroutine[object, object, T]) -> T | None:
-    """Await a coroutine; cancel it and return None if `stop` is set first."""
+    """Return what a coroutine returns; if `stop` is set first, cancel it and return None.
+
+    It may still return something in spite of the cancellation: that is returned then.
+    """
     task, stopped = asyncio.ensure_future(waiting), asyncio.ensure_future(stop.wait())
     await asyncio.wait({task, stopped}, return_when=asyncio.FIRST_COMPLETED)
     stopped.cancel()

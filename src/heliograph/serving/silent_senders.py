@@ -43,17 +43,22 @@ class SilenceWatch:
     """
 
     def __init__(self, fleet: Fleet, every: float | None):
-        """Begin with nothing published; `every`: seconds after which an estimate is published again; None for never."""
+        """Begin with nothing published.
+
+        Args:
+            fleet: the plants of the network.
+            every: seconds after which an estimate is published again although it has hardly changed; None for never.
+        """
         self.fleet, self.every = fleet, every
-        self._begun, self._looked = monotonic(), -inf  # seconds of the start, and of the last look for timeouts
-        self._published: dict[str, PublishedEstimate] = {}  # the newest of each plant
-        self._resumed = set[str]()  # plants from before this start; their messages may still wait at a broker
-        # Columns (filter, state) of each filter's mean, and of the diagonal of its covariance (n, n), row by row.
-        n, all_columns = len(fleet.network.states), fleet.program.filter_columns
-        self._means = np.array([[each.mean + i for i in range(n)] for each in all_columns], dtype=int)
-        self._variances = np.array(
-            [[each.covariance + i * (n + 1) for i in range(n)] for each in all_columns], dtype=int
-        )
+        # By the monotonic clock: when the service started, and when timeouts were last looked for.
+        self._begun, self._looked = monotonic(), -inf
+        self._published: dict[str, PublishedEstimate] = {}  # by plant, its newest published estimate
+        self._resumed = set[str]()  # plants that were stored before this start: messages for them may wait at a broker
+        # Where a row's outputs have the numbers whose changes count: columns (filter, state) of the filters' means, and
+        # of their variances. Each filter's mean (n,) and covariance (n, n), row by row, begin at a column.
+        n, filters = len(fleet.network.states), fleet.program.filter_columns
+        self._means = np.array([[each.mean + i for i in range(n)] for each in filters], dtype=int)
+        self._variances = np.array([[each.covariance + i * (n + 1) for i in range(n)] for each in filters], dtype=int)
 
     def resume(self, names: Iterable[str]) -> None:
         """Note plants that a service goes on with, of which messages may wait somewhere."""
@@ -134,9 +139,15 @@ class SilenceWatch:
         return [pair for pair, output in zip(rows, outputs, strict=True) if self._is_worth_publishing(*pair, output)]
 
     def _is_worth_publishing(self, plant: PlantState, row: HeldRow, output: np.ndarray) -> bool:
-        """Return whether a row is worth publishing: a sender died, `every` is over, a mean or deviation has moved.
+        """Return whether a plant's estimate has changed so much that it is worth publishing.
 
-        Moved: by more than MOVED, a tenth, of the deviation as published. `output`: all filters' estimates after it.
+        It has if a sender died or came back, if the time `every` is over, or if a mean or a deviation has moved by more
+        than MOVED, a tenth, of the deviation that was published.
+
+        Args:
+            plant: the plant.
+            row: its row, predicted without measurements.
+            output: the row's outputs: all filters' estimates.
         """
         published = self._published.get(plant.name)
         if published is None or published.dead != self._dead_senders(plant):

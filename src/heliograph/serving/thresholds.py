@@ -32,6 +32,7 @@ class Threshold(NamedTuple):
     above: bool
 
     def __str__(self) -> str:
+        """Return the threshold as it is typed: level>30."""
         return f"{self.name}{'>' if self.above else '<'}{self.level:g}"
 
 
@@ -88,6 +89,7 @@ def find_crossing_probabilities(
     """
     node, filter_name = node_and_filter
     ahead = int(horizons[-1]) if whole else horizons
+    # `ahead` as a number asks for every step up to it, as a list for these times alone.
     paths = heliograph.forecasting.draw_paths(source, ahead, "held", DRAWS, node=node, filter=filter_name)
     # Row of each horizon in the paths, which have every step, or the horizons alone.
     rows = [int(horizon) - 1 for horizon in horizons] if whole else range(len(horizons))
@@ -95,7 +97,8 @@ def find_crossing_probabilities(
     for threshold in thresholds:
         beyond = paths.is_beyond(*threshold)  # (path, row)
         # Share of the paths that are beyond at a row, and that were at any row up to it, with its standard error.
-        then, by = beyond.mean(axis=0), np.logical_or.accumulate(beyond, axis=1).mean(axis=0)
+        then = beyond.mean(axis=0)
+        by = np.logical_or.accumulate(beyond, axis=1).mean(axis=0)
         error = np.sqrt(by * (1 - by) / DRAWS)
         found[str(threshold)] = [
             {"then": float(then[i]), "by": float(by[i]), "by_error": float(error[i])} for i in rows

@@ -22,21 +22,21 @@ def retry_while_away(act: Callable[[], T], stop: asyncio.Event) -> T:
     Raises:
         AwayError: the store is away, and `stop` is set.
     """
-    wait, trouble = FIRST, False
+    wait, was_away = FIRST, False  # seconds of the next wait
     while True:
         try:
             done = act()
         except AwayError as error:
             if stop.is_set():
                 raise
-            shortened = wait * random.uniform(0.5, 1.0)
-            LOG.warning("%s; trying again in %.1f s", error, shortened)
-            wait, trouble = min(2 * wait, LONGEST), True
-            while shortened > 0 and not stop.is_set():
+            left = wait * random.uniform(0.5, 1.0)  # seconds; drawn, so that processes do not all come at once
+            LOG.warning("%s; trying again in %.1f s", error, left)
+            wait, was_away = min(2 * wait, LONGEST), True
+            while left > 0 and not stop.is_set():
                 sleep(LOOK)
-                shortened -= LOOK
+                left -= LOOK
         else:
-            if trouble:
+            if was_away:
                 LOG.info("the store is there again")
             return done
 
@@ -48,8 +48,9 @@ class WaitingService:
     """
 
     def __init__(self, service: BatchService, stop: asyncio.Event):
-        """Hold the service, whose last commit did not fail, and the event by which waiting ends."""
-        self.service, self._stop, self._failed = service, stop, False
+        """Hold the service; `stop` is the event by which waiting ends."""
+        self.service, self._stop = service, stop
+        self._failed = False  # whether the service's last commit failed
 
     def unpublished(self) -> list[Output]:
         """Return outputs that were committed before a restart and may not have been published."""
@@ -78,5 +79,5 @@ class WaitingService:
         self.service.published(outputs)
 
     def finish(self, ended: bool) -> list[Output]:
-        """Let the service commit everything."""
+        """Let the service commit everything, and return its last outputs. `ended`: no more messages can come."""
         return retry_while_away(lambda: self.service.finish(ended), self._stop)

@@ -50,6 +50,12 @@ def test_lines_are_whole_however_they_are_cut():
     assert fed([]) == []
 
 
+def test_a_carriage_return_ends_lines_that_come_one_by_one():
+    # What follows it comes in the next piece: only then is it known that no newline does.
+    assert fed([b"one\r", b"two\r", b"three\r"]) == [b"one", b"two", b"three"]
+    assert fed([b"one\r", b"\ntwo\r\n", b"three"]) == [b"one\r", b"two\r", b"three"]
+
+
 def test_a_line_without_an_end_is_bounded(monkeypatch):
     result = fed([b"a\n" + b"x" * 60_000 for _ in range(LONGEST // 60_000 + 3)] + [b"\nb\n"])
     assert result[0] == b"a" and result[-1] == b"b" and max(map(len, result)) <= LONGEST + 262_144

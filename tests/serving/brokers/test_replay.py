@@ -78,6 +78,10 @@ def test_a_recorded_trace_is_followed_and_inputs_are_not_on_the_way(tmp_path):
     assert [(e.node, e.sequence, e.arrival) for e in result] == [
         ("inputs", 0, 0.0), ("a", 0, 0.5), ("a", 3, 3.5), ("a", 2, 4.0), ("a", 5, 7.0),
     ]  # fmt: skip
+    for never in ("inf", "1e300"):  # a message cannot state such an arrival: JSON has no infinity
+        (tmp_path / "trace.csv").write_text(f"delay\n0.5\n{never}\n")
+        with pytest.raises(ValueError, match=r"column 'delay': expected at most 1e\+12; nan where"):
+            delay_as_traced(events, tmp_path / "trace.csv")
     (tmp_path / "trace.csv").write_text("lag\n0.5\n")
     with pytest.raises(ValueError, match="delay"):
         delay_as_traced(events, tmp_path / "trace.csv")

@@ -25,8 +25,8 @@ class RemarkWatch:
     def find_new(self, plants: Iterable[PlantState]) -> Iterator[tuple[str, str]]:
         """Yield (name of the plant, line) for each new remark of a filter on its state.
 
-        `remark.times` says how often the filter has made its remark so far. `plant.remarked` says how often this was
-        passed on, by (node, filter), and `counts` sums this over all plants.
+        A filter's state counts how often the filter made its remark (`remark.times`). A remark is new if that is more
+        than was passed on before, which `plant.remarked` has by (node, filter); `counts` sums this over all plants.
         """
         for plant in plants if self.counts else ():
             newest_row = plant.rows.held[-1]
@@ -44,7 +44,8 @@ class RemarkWatch:
     def _read_remarks(self, row: HeldRow) -> dict[tuple[str, str], Any]:
         """Return the remark of each filter on its state after a row, by node and filter.
 
-        `counts` has an entry for each filter that can say anything.
+        A remark has `words`, and `times`: how often it was made. Filters that can never make one have none; `counts`
+        has the others.
         """
         if not self.counts:
             return {}

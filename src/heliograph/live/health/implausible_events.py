@@ -1,6 +1,6 @@
 """Plausibility of the events of a batch: an event is implausible if no filter of its node could use it."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from math import nan
 from typing import NamedTuple
 
@@ -19,7 +19,8 @@ from heliograph.simulation.description.angle_doubts import WideAngles
 from heliograph.simulation.network import Network
 from heliograph.simulation.rows.output_columns import FilterColumns
 
-TRIES = 10  # to find the function of a filter that returned no number
+TRIES = 10  # so often the function of a filter that returned no number is looked for
+# Fields of a judgement that are above 0 if the filter objects: to a measurement (reason), to inputs (input).
 FLAGS = [Judgement._fields.index(name) for name in ("reason", "input")]
 
 
@@ -41,21 +42,25 @@ class JudgementReader:
     def __init__(self, fleet: Fleet):
         """Find, for each node, the columns of a row's outputs that say whether its events were plausible.
 
-        These are judgements by the node's own filters. Events of nodes without a filter are judged by central ones.
+        A step computes estimates and judgements as the outputs of a row. A node's events are judged by its own filters;
+        where it has none, by the central ones, which take the measurements of all nodes.
         """
-        self.fleet, all_columns = fleet, fleet.program.filter_columns
-        # Columns (filter, field of `Judgement`) of all filters, and of the central ones.
-        self._all_columns = _find_judgement_columns(all_columns)
-        central = _find_judgement_columns([each for each in all_columns if each.node == Network.FUSED])
-        # By index of a node: the columns of judgements on its events, and whether central filters make them.
+        self.fleet = fleet
+        all_filters = fleet.program.filter_columns  # for each filter the columns of its outputs
+        # Arrays of columns, (filter, field of `Judgement`): of all filters, and of the central ones.
+        self._all_columns = _find_judgement_columns(all_filters)
+        central = _find_judgement_columns([each for each in all_filters if each.node == Network.FUSED])
+        # {index of a node: such columns of the filters that judge its events}; nodes that central filters judge.
         self._judgement_columns, self._judged_centrally = dict[int, np.ndarray](), set[int]()
         for index, name in enumerate(fleet.network.names):
-            of_node = [each for each in all_columns if each.node == name and _takes_measurements(fleet, each)]
+            of_node = [each for each in all_filters if each.node == name and _takes_measurements(fleet, each)]
             own = _find_judgement_columns(of_node)
-            self._judgement_columns[index] = own if len(own) else central
-            if not len(own):
+            if len(own):
+                self._judgement_columns[index] = own
+            else:
+                self._judgement_columns[index] = central
                 self._judged_centrally.add(index)
-        # By node and filter: how often a faulty function was looked for, and the sentence that was found.
+        # {(node, filter): (how often its functions were searched for a faulty one, the sentence found or "")}.
         self._faults: dict[tuple[str, str], tuple[int, str]] = {}
 
     def explain_implausible_inputs(
@@ -86,37 +91,23 @@ class JudgementReader:
         """
         if not taken:
             return {}
+        # Below, i and j are indices of candidates in `taken`.
         flagged = self._find_flagged(taken)
         reasons = {i: why for i in flagged if (why := self._explain_event(taken[i]))}
         # Of several nodes' events that were judged together only the one to blame stays in `reasons`.
         self._drop_blameless(taken, reasons)
-        # By row and node, the index of the event with the largest number.
-        largest: dict[tuple[int, int], int] = {}
-        for i in reasons:
-            node_of_row = taken[i].row.slot, taken[i].event.node_index
-            largest[node_of_row] = max(
-                largest.get(node_of_row, i), i, key=lambda j: _find_largest_number(taken[j].event)
-            )
-        # By plant, the index of its first implausible inputs. Later events were judged with them, and may be all right
-        # without them.
-        first_inputs: dict[str, int] = {}
-        for i in reasons:
-            if taken[i].event.is_inputs:
-                first = first_inputs.setdefault(taken[i].plant.name, i)
-                first_inputs[taken[i].plant.name] = min(first, i, key=lambda j: taken[j].row.key)
         # The largest event of its node in its row; but of a plant with implausible inputs only the first of these.
-        to_refuse = [i for i in reasons if i in largest.values() and first_inputs.get(taken[i].plant.name, i) == i]
+        largest, first_inputs = _find_largest_events(taken, reasons), _find_first_inputs(taken, reasons)
+        to_refuse = [i for i in reasons if i in largest and first_inputs.get(taken[i].plant.name, i) == i]
         return {i: reasons[i] + self._name_faulty_function(taken[i]) for i in to_refuse}
 
     def _find_flagged(self, taken: Sequence[CandidateEvent]) -> list[int]:
-        """Return the indices of the candidates in whose rows some filter's judgement raises a flag.
-
-        FLAGS says which numbers of a judgement are flags: they are above 0 if it objects to a measurement or to inputs.
-        A slot is the number of a row in the table.
-        """
-        state_table, slots = self.fleet.state_table, np.array([candidate.row.slot for candidate in taken])
-        flags = state_table.outputs.start + self._all_columns[:, FLAGS].ravel()
-        flagged: list[int] = np.flatnonzero((state_table.table[slots[:, None], flags] > 0).any(axis=1)).tolist()
+        """Return the indices of the candidates in whose rows some filter objects to a measurement or to inputs."""
+        state_table = self.fleet.state_table
+        slots = np.array([candidate.row.slot for candidate in taken])  # a row's line in the table
+        columns = state_table.outputs.start + self._all_columns[:, FLAGS].ravel()  # of the flags of all filters
+        flags = state_table.table[slots[:, None], columns]  # (candidate, flag); above 0 if a filter objects
+        flagged: list[int] = np.flatnonzero((flags > 0).any(axis=1)).tolist()
         return flagged
 
     def _explain_event(self, candidate: CandidateEvent) -> str | None:
@@ -135,15 +126,11 @@ class JudgementReader:
 
         A filter whose function returns NaN or infinity judges every event to be no number; the name of the function
         tells the user what to mend. A fault, once found, is repeated without another search. A filter is searched at
-        most TRIES times, for a plant may send implausible events for ever. `candidate` is an event with its plant and
-        the row of measurements that it stands in; a slot is the number of a row in the table of live states, and
-        `columns` says where the outputs of a filter stand in such a row: among them its judgement of the measurements.
+        most TRIES times, for a plant may send implausible events for ever.
         """
         event, row = candidate.event, candidate.row
-        row_before, outputs = (
-            self._find_row_before(candidate),
-            self.fleet.state_table.table[row.slot, self.fleet.state_table.outputs],
-        )
+        row_before = self._find_row_before(candidate)
+        outputs = self.fleet.state_table.table[row.slot, self.fleet.state_table.outputs]
         # Filters that take the event: of its node, or of all nodes. Inputs concern every filter.
         concerned = None if event.is_inputs else (Network.FUSED, self.fleet.network.names[event.node_index])
         for columns in self.fleet.program.filter_columns:
@@ -172,10 +159,10 @@ class JudgementReader:
     def _estimate_after(self, row: HeldRow, filter: AbstractFilter, columns: FilterColumns) -> Estimate:
         """Return a filter's estimate after a row; for the row before all events this is the initial estimate.
 
-        row.key[1] is the number of a node, or BEFORE for the row before all events. `columns` says where the mean and
-        covariance begin among the row's outputs.
+        `columns` says where the mean and the covariance begin among the row's outputs.
         """
-        if row.key[1] == BEFORE:  # no estimate was computed there
+        _time, node, _count = row.key
+        if node == BEFORE:  # the row before all events, where no estimate was computed
             return filter.estimate(filter.init())
         n, outputs = len(filter.states), self.fleet.state_table.table[row.slot, self.fleet.state_table.outputs]
         covariance = outputs[columns.covariance : columns.covariance + n * n].reshape(n, n)
@@ -186,13 +173,14 @@ class JudgementReader:
 
         That is the first, from the largest on, without which the row is plausible; the largest if there is none.
         """
-        # Events of nodes without a filter of their own, by row.
+        # {slot of a row: indices of the row's events that central filters judged}.
         by_row: dict[int, list[int]] = {}
         for i in reasons:
             if taken[i].event.node_index in self._judged_centrally:
                 by_row.setdefault(taken[i].row.slot, []).append(i)
         for together in by_row.values():
             if len({taken[i].event.node_index for i in together}) > 1:
+                # Among several nodes' events: tried from the largest number on, until the row is plausible without.
                 culprit = Judgement.find_culprit(
                     together,
                     lambda i: _find_largest_number(taken[i].event),
@@ -207,7 +195,7 @@ class JudgementReader:
         # Copy the row to a slot of its own, with NaN for the node's numbers.
         event, row = candidate.event, candidate.row
         state_table, rows = self.fleet.state_table, candidate.plant.rows
-        trial = HeldRow(row.key, state_table.take_slot(), self.fleet.width)
+        trial = HeldRow(row.key, state_table.take_slot(), self.fleet.layout.width)
         trial.numbers = row.numbers.copy()
         columns = rows.columns_by_node[event.node_index]
         trial.numbers[columns] = [nan] * (columns.stop - columns.start)
@@ -219,13 +207,36 @@ class JudgementReader:
         return Judgement.why_values(judgements) is None
 
 
+def _find_largest_events(taken: Sequence[CandidateEvent], indices: Iterable[int]) -> set[int]:
+    """Return, of the candidates with these indices, those of the event with the largest number of its node and row."""
+    largest: dict[tuple[int, int], int] = {}  # {(row, node): index of the event with the largest number so far}
+    for i in indices:
+        row_and_node = taken[i].row.slot, taken[i].event.node_index
+        before = largest.get(row_and_node, i)
+        largest[row_and_node] = max(before, i, key=lambda j: _find_largest_number(taken[j].event))
+    return set(largest.values())
+
+
+def _find_first_inputs(taken: Sequence[CandidateEvent], indices: Iterable[int]) -> dict[str, int]:
+    """Return {plant: which of the candidates with these indices has its first inputs}, of plants with inputs there."""
+    first_inputs: dict[str, int] = {}
+    for i in indices:
+        if taken[i].event.is_inputs:
+            first = first_inputs.setdefault(taken[i].plant.name, i)
+            first_inputs[taken[i].plant.name] = min(first, i, key=lambda j: taken[j].row.key)  # by time first
+    return first_inputs
+
+
 def _find_largest_number(event: CheckedEvent) -> float:
-    """Return the largest absolute number of an event, -1 if it has none."""
+    """Return the largest absolute number of an event; -1 if all its values are NaN."""
     return float(np.max(np.abs(event.values), initial=-1.0, where=~np.isnan(event.values)))
 
 
 def _find_judgement_columns(outputs: Sequence[FilterColumns]) -> np.ndarray:
-    """Return the columns of these filters' judgements on what they received (filter, field of `Judgement`)."""
+    """Return in which columns of a row's outputs these filters' judgements stand: (filter, field of `Judgement`).
+
+    Filters that judge nothing are left out.
+    """
     results = [list(output.judgement) for output in outputs if output.judgement is not None]
     return np.array(results, dtype=int).reshape(-1, len(Judgement._fields))
 
@@ -255,11 +266,12 @@ class AngleWatch:
 
     def find_new(self, plants: Sequence[PlantState]) -> list[tuple[str, str]]:
         """Return (name of the plant, line) for each angle whose doubt shows in a newest row for the first time."""
-        # `angles.states` and `angles.received` lose each angle that was reported: a filter without any needs no watch.
+        # `angles.states` and `angles.received` lose each angle that was reported; one without any needs no watch.
         self._states = [watched for watched in self._states if watched.angles.states]
         self._received = [watched for watched in self._received if watched.angles.received]
         if not self._states and not self._received:
             return []
+        # Lines of the table with the newest rows: the numbers of one plant's angles are a line of the arrays below.
         slots = np.array([plant.rows.held[-1].slot for plant in plants], dtype=int)
         wide = [
             (plants[row].name, f"{name}: {line}")
@@ -290,9 +302,10 @@ def _watch_states(fleet: Fleet) -> list[WatchedAngles]:
 
 
 def _watch_received(fleet: Fleet) -> list[WatchedAngles]:
-    """Return what each node receives, to watch by a filter that takes it: its own, or one of all nodes.
+    """Return the received angles to watch, for degrees where the filter takes radians.
 
-    Each column is watched only once.
+    The filter that takes a measurement knows which of its numbers are angles: the node's own, or one of all nodes. A
+    number that several filters take is watched only once.
     """
     watched, seen = list[WatchedAngles](), set[int]()
     for columns in fleet.program.filter_columns:

@@ -9,7 +9,7 @@ from heliograph.live.event import CheckedEvent, Verdict
 from heliograph.model.checks.refusal_reasons import Reason
 from heliograph.model.readings.repeated_readings import Repeats
 
-NO_REPEATS, NONE = Repeats(), dict[Reason, int]()
+NO_REPEATS, NONE = Repeats(), dict[Reason, int]()  # no reading has come; nothing is refused
 GAP = 1 << 14  # more messages in a row are not lost: the count began anew (LoRaWAN's MAX_FCNT_GAP)
 
 
@@ -30,7 +30,7 @@ class ScreenedEvent(NamedTuple):
 
     @property
     def is_empty(self) -> bool:
-        """Whether values were removed and none is left."""
+        """Return whether values were removed and none is left."""
         return bool(self.why) and all(value != value for value in self.event.values)
 
 
@@ -70,13 +70,19 @@ class LinkCounts:
     timeouts: int = 0
 
     def __post_init__(self) -> None:
-        """Convert stored fields: runs of equal readings, and refusals, which were one number until version 0.4.0."""
+        """Convert fields that were read from a store: runs of equal readings, and refusals.
+
+        Until version 0.4.0 refusals were one number, which is counted for the reason "limits".
+        """
         self.repeats = Repeats.read(self.repeats)
         if isinstance(self.refused, int):
             self.refused = {"limits": self.refused} if self.refused else {}
 
     def count_screened(self, screened: ScreenedEvent, verdict: Verdict) -> None:
-        """Count the values of an event that were refused; a copy, or an event of a wrong time, does not count."""
+        """Count the values of an event that were refused, and take over its runs of equal readings.
+
+        A copy of an event, or an event of a wrong time, does not count.
+        """
         if verdict in ("used", "implausible"):
             for reason, count in screened.refused.items():
                 self.count_refused(reason, count)
@@ -88,7 +94,7 @@ class LinkCounts:
 
     @property
     def held(self) -> int:
-        """Return how many runs of equal readings were longer than noise allows, of a node that refuses none."""
+        """Return how many runs of equal readings were longer than the sensor's noise allows, over all components."""
         return sum(self.repeats.found)
 
     def count_timeout(self, time: float, begun: float, timeout: float) -> None:
@@ -97,7 +103,8 @@ class LinkCounts:
         `begun`: when the silence began if the node has sent nothing before. Call this before `count`, which moves
         `latest`, the time of the newest measurement used, to this message.
         """
-        self.timeouts += time - (self.latest if self.used else begun) > timeout
+        silent_since = self.latest if self.used else begun
+        self.timeouts += time - silent_since > timeout
 
     def count(self, verdict: Verdict, sequence: int, time: float, period: int = 0) -> None:
         """Count one message; a late, implausible or future message was received too, so it fills a gap.
@@ -108,7 +115,7 @@ class LinkCounts:
         self._follow_sequence(verdict, sequence, time, period)
 
     def count_verdict(self, verdict: Verdict) -> None:
-        """Count one verdict alone, as of inputs beside a measurement, whose running count is the measurement's."""
+        """Count one verdict, but do not follow a running count, as for inputs that share a measurement's message."""
         # Each verdict has a count of the same name.
         setattr(self, verdict, getattr(self, verdict) + 1)
 
@@ -173,7 +180,8 @@ class LinkCounts:
         """
         if not period or self.newest < 0:
             return sequence
-        ahead, behind = (sequence - self.newest) % period, (self.newest - sequence) % period
+        ahead = (sequence - self.newest) % period  # least number of counts from `newest` on to a count that is sent so
+        behind = (self.newest - sequence) % period
         if time >= self.at:
             return self.newest + ahead if ahead <= GAP else sequence
         return self.newest - behind if behind <= min(GAP, self.newest) else sequence

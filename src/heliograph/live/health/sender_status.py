@@ -42,7 +42,7 @@ class SenderStatus(NamedTuple):
 
     @property
     def dead(self) -> bool:
-        """True if it misses its heartbeats, and not by chance, or if it is silent for longer than its timeout."""
+        """Return whether it misses its heartbeats, and not by chance, or is silent for longer than its timeout."""
         return bool(self.reason)
 
     @property
@@ -70,7 +70,10 @@ class LossChain(NamedTuple):
 
     @staticmethod
     def of_channel(channel: Channel) -> "LossChain":
-        """Return the losses of a link: for each mode of the channel the probability that nothing arrives."""
+        """Return the losses of a link: for each mode of the channel the probability that nothing arrives.
+
+        Of a channel that varies over time its first step counts.
+        """
         modes = joint_modes(first(channel))
         loss_probabilities = [
             sum(float(outcome.probability) for outcome in mode.list_outcomes() if not outcome.arrived.any())
@@ -113,17 +116,23 @@ class SilenceRule(NamedTuple):
         return SilenceRule(node.trigger, losses=LossChain.of_channel(node.channel), timeout=node.timeout)
 
     def find_status(self, last: float | None, begun: float, final: float, now: float) -> SenderStatus:
-        """Return the sender's status, from the times of its newest value (`last`), of the newest final row, and of now.
+        """Return a sender's status: for how long it is silent, how many heartbeats are missing, and by what chance.
 
-        Before its first value (`last` is None) the sender is silent since `begun`. `silent` is its silence up to
-        `final`, which no late value can change. `provisional` is its silence from `final` to `now`, in which a late
-        value may still arrive. With a trigger (it decides when to send) all times are steps, and `missed` counts the
-        heartbeats (values due after a longest time) that did not come; `chance` is P(all of them were lost).
+        With a trigger, by which it decides when to send, all times are whole steps.
+
+        Args:
+            last: time of its newest value; None before the first.
+            begun: since when it may be silent if no value came yet.
+            final: the newest time for which no late value is taken any more. Silence up to then is `silent`, and
+                silence from then on `provisional`, since a late value may still fill it.
+            now: the present time.
         """
         silence_begin = begun if last is None else last
-        silent, provisional = max(final - silence_begin, 0), max(now - max(final, silence_begin), 0)
+        silent = max(final - silence_begin, 0)
+        provisional = max(now - max(final, silence_begin), 0)
         if self.trigger is None or self.losses is None:
             return SenderStatus(last, silent, provisional, missed=0, chance=1.0, timeout=self.timeout)
+        # Heartbeats: the longest time after which it sends in any case. `chance`: P(all that are missing were lost).
         last_step = None if last is None else int(last)
         missed = count_missed_heartbeats(self.trigger, last_step, int(silent), int(final))
         steps_between = 1 if self.trigger.heartbeat is None else int(self.trigger.heartbeat)
@@ -154,9 +163,14 @@ def find_silence_rules(network: Network) -> dict[str, SilenceRule]:
 
 
 def count_values_before_losses(network: Network, deciding: Mapping[str, AbstractTrigger]) -> dict[int, int]:
-    """Return {index of a node whose losses are known: how many of its numbers are values, before those on losses}.
+    """Return {index of a node: how many of the numbers that it receives are measured values}.
 
-    Losses are known if messages are numbered. `deciding` holds by node the triggers of senders that decide.
+    The nodes are those whose trigger decides when to send and whose messages are numbered. They receive [values,
+    numbers of lost messages]: how many messages were lost before this one, for all values or for each.
+
+    Args:
+        network: the network.
+        deciding: {name of a node whose sender decides when to send: its trigger}.
     """
     return {
         network.names.index(name): node.received - trigger.side_information(len(node.outputs))

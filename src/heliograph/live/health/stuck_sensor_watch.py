@@ -46,17 +46,26 @@ class RepeatWatch:
 
     @staticmethod
     def for_sensor(sensor: AnySensor | None, channel: Channel | None, received: int) -> "RepeatWatch | None":
-        """Return the watch for what arrives of a sensor; None if its law is not known, or readings arrive changed."""
+        """Return the watch for what arrives of a sensor; None if equal readings say nothing there.
+
+        That is so if no bound is known of how often its noise repeats a reading, or if the channel changes readings.
+
+        Args:
+            sensor: the sensor, with noise that may vary over time; None if it is not known.
+            channel: what its readings pass through; None if it is not known.
+            received: how many numbers arrive.
+        """
         steps = [] if sensor is None else unstack(sensor)
         if channel is None or not steps or not all(isinstance(step, AbstractSensor) for step in steps):
             return None
         if any(len(list_mode_models(step)) > 1 for step in steps):  # of modes, of which one may be that it is stuck
             return None
+        # All outputs have to arrive as they were measured.
         outputs = tuple(range(received))
         if len(steps[0].outputs) != received or not all(delivers_as_sent(link, outputs) for link in unstack(channel)):
             return None
         noises = list({id(step.noise): step.noise for step in steps}.values())
-        try:
+        try:  # whether there is a bound, at any resolution
             for noise in noises:
                 bound_probability_of_equal_readings(noise, np.full(received, inf))
         except ValueError:  # a law of which no bound is known
@@ -83,12 +92,13 @@ class RepeatWatch:
         this reading.
         """
         m, before = len(values), before or FIRST
-        # The fields of `Repeats`, as lists with an entry for each component; empty before the first reading. newest:
-        # last value; lengths: of its run; steps: least difference of two successive readings that differ; readings and
-        # equal: how many came, and how many equalled the one before; found: runs that became too long.
-        newest, lengths = list(before.newest or [np.nan] * m), list(before.lengths or [0] * m)
-        least_steps, readings = list(before.steps or [inf] * m), list(before.readings or [0] * m)
-        equal, found = list(before.equal or [0] * m), list(before.found or [0] * m)
+        # By component; the fields of `before` are empty before the first reading.
+        newest = list(before.newest or [np.nan] * m)  # the last value
+        lengths = list(before.lengths or [0] * m)  # how often it came in a row
+        least_steps = list(before.steps or [inf] * m)  # least difference of two successive readings that differ
+        readings = list(before.readings or [0] * m)  # how many came
+        equal = list(before.equal or [0] * m)  # how many equalled the one before
+        found = list(before.found or [0] * m)  # runs that became too long
         # For each component: the reading continues its run or begins a new one; then whether the run is now too long.
         for i, value in enumerate(values):
             if value != value:  # NaN: nothing arrived, and the run goes on

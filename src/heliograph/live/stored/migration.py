@@ -31,6 +31,8 @@ MOST = 64  # numbers of an array that are stored; of a longer one only a hash is
 def describe_network(fleet: Fleet, covariances: bool = False) -> str:
     """Return the numbers of a network by name, and where the state of each filter stands in a row, as JSON.
 
+    This is stored with a plant's rows: another network finds there what has changed, and which columns to read.
+
     Args:
         fleet: the plants of the network.
         covariances: whether its rows are of a version before 0.3.0, in which states held covariances.
@@ -40,15 +42,14 @@ def describe_network(fleet: Fleet, covariances: bool = False) -> str:
     parts |= {f"node {name!r}": node for name, node in network.nodes.items()}
     parts |= {f"fusion {name!r}": fusion for name, fusion in (network.fused | network.meshes).items()}
     filters, size = _number_state_columns(fleet, covariances)
-    # Before 0.3.0 no probabilities of modes were among the outputs.
-    outputs = fleet.state_table.step_rows.outputs.size - (
-        np.count_nonzero(_find_mode_columns(fleet)) if covariances else 0
-    )
+    outputs = fleet.state_table.step_rows.outputs.size
+    if covariances:  # before 0.3.0 no probabilities of modes were among the outputs
+        outputs -= int(np.count_nonzero(_find_mode_columns(fleet)))
     layout = {
         "nodes": {name: network.nodes[name].received for name in network.names},
         "given": fleet.program.given,
         "state": size,
-        "outputs": int(outputs),
+        "outputs": outputs,
         "filters": filters,
     }
     return json.dumps({"values": {name: _list_numbers_by_path(tree) for name, tree in parts.items()}, "layout": layout})
@@ -58,7 +59,9 @@ def _find_mode_columns(fleet: Fleet) -> Bool[np.ndarray, " outputs"]:
     """Return the mask of a network's outputs that is true where an output is the probability of a mode."""
     results = np.zeros(fleet.state_table.step_rows.outputs.size, bool)
     for columns in fleet.program.filter_columns:
-        results[slice(*(columns.modes or (0, 0)))] = True
+        if columns.modes is not None:
+            begin, end = columns.modes
+            results[begin:end] = True
     return results
 
 
@@ -101,7 +104,10 @@ class _ColumnCounter:
         return columns
 
     def note_part(self, filter_name: str, path: str, columns: np.ndarray) -> None:
-        """Note the columns of a filter's part, which stand side by side; `columns` has the part's shape."""
+        """Note in `filters` where a part of a filter's state stands: [its shape, first column, end of its columns].
+
+        `columns` has the column of each number of the part, in its shape; they stand side by side.
+        """
         first = int(columns.flat[0]) if columns.size else 0
         self.filters.setdefault(filter_name, {})[path] = [list(columns.shape), first, first + columns.size]
 
@@ -109,10 +115,15 @@ class _ColumnCounter:
 def _number_state_columns(fleet: Fleet, covariances: bool) -> tuple[dict[str, dict[str, list[Any]]], int]:
     """Return {name of filter: {path of a part: [shape, first column, end]}}, and how many columns the states have.
 
-    `covariances`: as before version 0.3.0, when states held covariances. A part is one array of a filter's state.
+    A part is one array of a filter's state, such as the mean.
+
+    Args:
+        fleet: the plants of the network.
+        covariances: whether to count as before version 0.3.0, when states held covariances, not their factors.
     """
     network, flat, counter = fleet.network, fleet.state_table.step_rows.state, _ColumnCounter(covariances)
-    # A row's state has the filters of nodes by kind, the central ones by name, then what fusions remember.
+    # A row's state has the filters of nodes by kind, the central ones by name, then what fusions remember. Only shapes
+    # count here: the tree is made of zeros.
     states_by_stack, central, *memory = flat.tree(np.zeros(flat.size))
     # Filters of one kind stand side by side: the leading axis of each part is (filter x node).
     for (group, filters), state in zip(network.stacks, states_by_stack, strict=True):
@@ -142,7 +153,7 @@ class PlantMigration:
     """
 
     def __init__(self, fleet: Fleet, mine: Identity, say: Callable[[str], None]):
-        """Hold the fleet, its network's identity, and `say`, which is called with a line for each change."""
+        """Hold the arguments (see the class); `begin` then reads what is stored."""
         self.fleet, self.mine, self._say = fleet, mine, say
         self._old: dict[str, Any] = {}  # "layout" of the network that is stored, as `describe_network` writes it
 
@@ -172,13 +183,19 @@ class PlantMigration:
             self._say(f"{what}: {line}")
 
     def _has_counterpart(self, name: str, new: Mapping[str, Mapping[str, Sequence[Any]]]) -> bool:
-        """Return whether the stored state of the filter of this name can be read as its state now."""
+        """Return whether the stored state of the filter of this name can be read as its state now.
+
+        `new`: by filter and path of a part of its state now [shape, first column, end].
+        """
         shapes_before = {path: shape for path, (shape, _, _) in self._old["filters"].get(name, {}).items()}
         shapes_now = {path: shape for path, (shape, _, _) in new.get(name, {}).items()}
         return can_read_layout(shapes_before, shapes_now)
 
     def migrate(self, bodies: Mapping[str, bytes]) -> dict[str, bytes]:
-        """Return {name of a plant: its bytes as this network stores them}, from the bytes that are stored."""
+        """Return {name of a plant: its bytes as this network stores them}, from the bytes that are stored.
+
+        The plants are in the fleet only for as long as it takes to step their rows again.
+        """
         plants = {name: unpack_plant(name, self._translate_plant(body), self.fleet) for name, body in bodies.items()}
         # All rows after the base are stepped again, with the network as it is now.
         for plant in plants.values():
@@ -211,13 +228,15 @@ class PlantMigration:
 
         Rows, events and counts of a node that is gone, or that receives another number of values now, are left out.
         """
-        network, sizes_before = self.fleet.network, self._old["nodes"]  # {node: how many numbers it received}
+        # {node: how many numbers it receives}, in the network that stored the plant, and in this one.
+        network, sizes_before = self.fleet.network, self._old["nodes"]
         sizes_here = {name: node.received for name, node in network.nodes.items()}
         kept = [name for name, received in sizes_before.items() if sizes_here.get(name) == received]
+        # {index of a node that stays, in the other network: its index here}.
         index_here = {i: network.names.index(name) for i, name in enumerate(sizes_before) if name in kept}
         index_here[-1] = -1  # the inputs
         parts = PlantParts.from_bytes(stored, self._count_columns_before())
-        rows = self._select_rows(parts, index_here)
+        rows = self._select_rows(parts, index_here)  # keys of the rows that stay, and which rows they were
         table = self._translate_table(parts.table[[row.number_before for row in rows]], index_here)
         assert table.shape[1] == self.fleet.state_table.table.shape[1]  # rows as this network has them
         events, times, values = self._translate_events(parts, rows, index_here)
@@ -245,12 +264,14 @@ class PlantMigration:
         Rows of nodes that this network lacks are left out. The first row (the base of all later ones) stays, and so
         does one before it, held until a jump of a clock is confirmed. `index_here`: {index in the old network: here}.
         """
-        joint, always_kept = self.fleet.rows_are_joint, 1 + (parts.head.get(BEFORE_LEAP) is not None)
+        joint = self.fleet.rows_are_joint  # whether events of several nodes share a row
+        always_kept = 1 + (parts.head.get(BEFORE_LEAP) is not None)
         rows = []
         for i, (node, sequence) in enumerate(parts.keys.tolist()):
-            if i < always_kept or joint or node in index_here:  # joint rows are of several nodes
+            if i < always_kept or joint or node in index_here:
                 node_here = node if joint or node == BEFORE else index_here.get(node, BEFORE)
-                rows.append(_MovedRow(float(parts.table[i, -1]), node_here, sequence, i))
+                time = float(parts.table[i, -1])
+                rows.append(_MovedRow(time, node_here, sequence, number_before=i))
         return [*rows[:always_kept], *sorted(rows[always_kept:])]
 
     def _translate_events(
@@ -258,8 +279,12 @@ class PlantMigration:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return three arrays on the events that stay: their (row, node, count), their times, and all their values.
 
-        The shapes are (events, 3), (events,), and (numbers,), where events' values follow one another. `rows` are the
-        rows that stay. `index_here` maps a node's index in the other network to its index in this one.
+        The shapes are (events, 3), (events,), and (numbers,), where events' values follow one another.
+
+        Args:
+            parts: the stored plant.
+            rows: the rows that stay.
+            index_here: maps a node's index in the other network to its index in this one.
         """
         row_here = {row.number_before: i for i, row in enumerate(rows)}
         # An event of inputs (node -1) has as many values as there are inputs, any other as many as its node receives.
@@ -288,7 +313,8 @@ class PlantMigration:
         held = old["state"] + old["outputs"]
         step = held + old["given"]
         measured = step + 1
-        translated[:, state_table.held], translated[:, state_table.at] = table[:, held:step], table[:, step:measured]
+        translated[:, state_table.held_inputs] = table[:, held:step]
+        translated[:, state_table.step_number] = table[:, step:measured]
         translated[:, state_table.numbers] = self._translate_numbers(table[:, measured:], index_here)
         return translated
 

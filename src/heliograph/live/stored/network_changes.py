@@ -18,6 +18,7 @@ def list_changes(mine: Identity, other: Identity) -> list[str]:
     `other` describes the network by which a state was stored, `mine` the present one: options, versions, nodes and
     filters, numbers of the parts. A change of functions is listed only where nothing else has changed.
     """
+    # Entries whose values are no words for a user: JSON, and hashes.
     not_words = (DESCRIPTION, "what is computed", "layout of the store")
     # First the entries that are words, shown as they stand: options, versions, nodes, filters.
     lines = [

@@ -31,7 +31,8 @@ def split_by_path(state: PyTree) -> dict[str, np.ndarray]:
 def can_read_layout(old: Shapes, new: Shapes) -> bool:
     """Return whether a state of the layout `old` can be read as one of `new`.
 
-    It can if each part of `new` is in `old` with the same shape, or is a factor of a covariance in `old`.
+    It can if each part of `new` is in `old` with the same shape, or is a factor of a covariance in `old`. A layout has
+    the shape of each part of a state.
 
     A part is known by its path: a stem and an ending such as ".covariance". A covariance's factors have the endings
     LOWER (L below the diagonal, n (n - 1) / 2 numbers) and VARIANCES (D, n numbers).
@@ -83,7 +84,7 @@ class _StatePart:
 
     @property
     def columns(self) -> range:
-        """Return its columns."""
+        """Return the numbers of its columns."""
         return range(self.first, self.end)
 
 
@@ -164,11 +165,11 @@ def _is_lost_flag(part: _StatePart, end: int, taken: set[int]) -> bool:
 def factorise_covariance(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the factors of P = L D L': L's entries below the diagonal (..., n (n - 1) / 2), by row, and D (..., n).
 
-    Many covariances P (..., n, n) are eliminated at once. A pivot below n eps times its variance is rounding, and is
-    set to this bound.
+    Many covariances P (..., n, n) are eliminated at once, column by column: with the remainder R, at first P, the pivot
+    is D_j = R_jj, the column of L below the diagonal is l = R_ij / D_j (i > j), and R goes on as R - l D_j l'. A pivot
+    below n eps times its variance is rounding, and is set to this bound.
     """
     n = covariance.shape[-1]
-    # `remainder` is what is left of P after the columns before j are eliminated.
     remainder, diagonal_of_P = covariance.copy(), np.diagonal(covariance, axis1=-2, axis2=-1)
     L, D = np.zeros_like(remainder), np.zeros_like(diagonal_of_P)
     for j in range(n):
@@ -192,7 +193,8 @@ def _trace_paths(old: Iterable[str], new: Iterable[str]) -> dict[str, str]:
 def _flatten_path(path: str) -> str:
     """Return the path that a part had before its Gaussian was nested: '.gaussian.mean' stood as '.mean'."""
     stem, dot, name = path.rpartition(".")
-    return stem.removesuffix(NESTED) + dot + name if dot + name in (MEAN, LOWER, VARIANCES) else path
+    is_part_of_gaussian = dot + name in (MEAN, LOWER, VARIANCES)
+    return stem.removesuffix(NESTED) + dot + name if is_part_of_gaussian else path
 
 
 def _find_factored(old: Iterable[str], new: Iterable[str]) -> list[str]:

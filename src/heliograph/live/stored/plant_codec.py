@@ -42,7 +42,7 @@ class PlantParts(NamedTuple):
     values: np.ndarray
 
     def to_bytes(self) -> bytes:
-        """Serialise: lengths of the parts, then the parts."""
+        """Return the parts as bytes: their lengths, the head as JSON, then the arrays one after another."""
         return _pack_parts(self.head, *(array.ravel() for array in self[1:]))
 
     @staticmethod
@@ -54,8 +54,9 @@ class PlantParts(NamedTuple):
         are not zero are stored if the head says how many (KEPT).
         """
         length, rows, events, numbers = HEAD.unpack_from(data)
+        at = HEAD.size + length  # the byte that is read next
+        head, arrays = json.loads(data[HEAD.size : at]), list[np.ndarray]()
         # Node and step of each row; row, node and count of each event; the table; the events' times; their values.
-        head, at, arrays = json.loads(data[HEAD.size : HEAD.size + length]), HEAD.size + length, list[np.ndarray]()
         shapes = ((rows, 2), (events, 3), (rows, width), (events,), (numbers,))
         for number, (kind, shape) in enumerate(zip(TYPES, shapes, strict=True)):
             if number == TABLE and KEPT in head:
@@ -73,8 +74,8 @@ def pack_plant(plant: PlantState, fleet: Fleet) -> bytes:
     """Return a plant as bytes, which `unpack_plant` reads; it must have no changes that could still be undone.
 
     A service writes these bytes to its store, so that the plant goes on after a restart. The head has its times, counts
-    of messages and newest leap (gap in time that one clock alone shows). The arrays have its rows, one for each time or
-    event whose state is held because late data may still change it, and the events in them.
+    of messages and newest leap (a jump in time that one clock alone shows). The arrays have its rows, one for each time
+    or event whose state is held because late data may still change it, and the events in them.
 
     Args:
         plant: times, message counts and rows of one plant; a row says by `slot` where its state is.
@@ -90,12 +91,12 @@ def pack_plant(plant: PlantState, fleet: Fleet) -> bytes:
         "leap": None if plant.leap is None else _pack_leap(plant.leap),
         BEFORE_LEAP: None if plant.row_before_leap is None else plant.row_before_leap.now,
     }
-    # First the row from before a leap, where one is held in case the leap is undone (`row_before_leap`); then all
-    # others.
-    rows = [*([] if plant.row_before_leap is None else [plant.row_before_leap.row]), *plant.rows.held]
+    # First the row from before a leap, where one is held in case the leap is undone; then all others.
+    rows_before_leap = [] if plant.row_before_leap is None else [plant.row_before_leap.row]
+    rows = [*rows_before_leap, *plant.rows.held]
     # Whole numbers, one after another: (node, sequence) of each row, and (number of the row, node, sequence) of each
     # event. Their times are no whole numbers, and stand apart; the time of a row is in the table.
-    keys = [number for row in rows for number in row.key[1:]]
+    keys = [number for row in rows for number in row.key[1:]]  # a key is (time, node, sequence)
     events_by_row = [(i, *event) for i, row in enumerate(rows) for event in row.events]
     events = [number for i, node, sequence, _ in events_by_row for number in (i, node, sequence)]
     table = fleet.state_table.table[[row.slot for row in rows]].ravel()
@@ -144,16 +145,17 @@ def unpack_plant(name: str, data: bytes, fleet: Fleet) -> PlantState:
     """Return the plant `name` from what `pack_plant` returned, with its rows in new slots of the fleet's table.
 
     The bytes hold the rows of live data that late events may still change, with the filters' states after each, and a
-    head: times, counts of messages and what is known of clocks. The base, the first row, is the newest one that is
-    final; later rows are stepped from it. A slot is a row of the fleet's table of filter states.
+    head, {"now", "forced", "begun", "origin", "links", "leap", "before a leap"}: times, counts of messages by node, and
+    jumps of clocks that are in doubt. A slot is a line of the fleet's table of filter states.
     """
     parts = PlantParts.from_bytes(data, fleet.state_table.table.shape[1])
     head, rows = parts.head, _make_rows_with_events(parts, fleet)
     # If the plant was stored after a leap (a jump of a clock) that may still be undone, its first row is the one before
-    # the leap, and the head has the newest arrival before it.
-    moment_before = head.get(BEFORE_LEAP)
-    row_before_leap = None if moment_before is None else RowBeforeLeap(rows.pop(0), moment_before)
-    base = rows[0]
+    # the leap, which is no row of the history, and the head has the newest arrival before it.
+    row_before_leap, moment_before = None, head.get(BEFORE_LEAP)
+    if moment_before is not None:
+        row_before_leap = RowBeforeLeap(rows.pop(0), moment_before)
+    base = rows[0]  # the newest row that is final, from which later ones are stepped
     sorted_rows = fleet.make_rows(base)
     sorted_rows.replace_rows(rows)
     return PlantState(
@@ -178,7 +180,7 @@ def _make_rows_with_events(parts: PlantParts, fleet: Fleet) -> list[HeldRow]:
     # The values of all events follow one another; each has as many as its node sends.
     begin = 0
     for time, (i, node, sequence) in zip(parts.times.tolist(), parts.events.tolist(), strict=True):
-        end = begin + fleet.count_values(node)
+        end = begin + fleet.layout.count_values(node)
         rows[i].events[node, sequence, time] = parts.values[begin:end].tolist()
         begin = end
     return rows
@@ -208,6 +210,6 @@ def _make_held_row(fleet: Fleet, numbers: np.ndarray, node: int, sequence: int) 
     """Return a row with the key (time, node, sequence), whose numbers stand in a new slot of the fleet's table."""
     slot = fleet.state_table.take_slot()
     fleet.state_table.table[slot] = numbers
-    row = HeldRow((float(numbers[-1]), node, sequence), slot, fleet.width)
+    row = HeldRow((float(numbers[-1]), node, sequence), slot, fleet.layout.width)
     row.numbers = numbers[fleet.state_table.numbers].tolist()
     return row

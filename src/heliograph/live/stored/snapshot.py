@@ -79,7 +79,7 @@ def pack_snapshot(head: Mapping[str, object], arrays: Mapping[str, np.ndarray]) 
 
 
 def unpack_snapshot(data: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Return the head and the arrays, by name, of what `pack_snapshot` wrote."""
+    """Return the head and the arrays, by name, of what `pack_snapshot` wrote; raise ValueError for other bytes."""
     try:
         with np.load(BytesIO(data), allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}

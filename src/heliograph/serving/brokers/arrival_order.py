@@ -38,13 +38,14 @@ class ArrivalOrder:
     def __init__(self, source: str, steps: bool) -> None:
         """Begin without messages. `source`: name of the file, for errors. `steps`: whether times are step numbers."""
         self._source, self._steps = source, steps
-        self._held = list[HeldPayload]()  # a heap, ordered by moment and then by count
-        self._count, self._last = 0, float("-inf")  # how many payloads came so far; the moment of the newest
+        self._held = list[HeldPayload]()  # a heap, ordered by moment and then by number
+        self._count = 0  # how many payloads came so far
+        self._last = float("-inf")  # moment of the newest payload, which one that is no message gets too
 
     def add_messages(self, payloads: Sequence[Payload]) -> list[Payload]:
         """Add messages to those that wait; return the earliest ones, so that at most HELD still wait.
 
-        A heap orders messages by moment, and by count if moments are equal.
+        They are ordered by moment, when they arrived or else were measured, and by number if moments are equal.
         """
         results = list[Payload]()
         for payload in payloads:
@@ -67,8 +68,11 @@ class ArrivalOrder:
         return [heappop(self._held).payload for _ in range(len(self._held))]
 
     def _refuse_unset_times(self) -> None:
-        """Put errors in the place of messages whose times were not set."""
-        # In the order of the lines; dates and numbers of a node apart.
+        """Put errors in the place of messages whose times were not set: far from the others of their node.
+
+        This holds for messages that do not say when they arrived. Step numbers are never far.
+        """
+        # By (plant, node, whether times are dates), in the order of the lines.
         by_node = defaultdict[tuple[str, str, bool], list[HeldPayload]](list)
         for entry in sorted(self._held, key=lambda entry: entry.number):
             if isinstance(message := entry.payload, Message | NumberedMessage):

@@ -39,6 +39,7 @@ class Address:
     password: str | None = field(default=None, repr=False)
 
     def __str__(self) -> str:
+        """Return the URL, without user and password."""
         return f"{self.kind}{'+tls' if self.secure else ''}://{self.host}:{self.port}/{self.topic}"
 
     def tls(self) -> ssl.SSLContext | None:

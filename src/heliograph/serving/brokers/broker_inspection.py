@@ -22,17 +22,17 @@ def listen(address: Address, seconds: float) -> dict[str, TopicStatistics]:
     Raises:
         ValueError: there is no connection. The error names the broker.
     """
-    topics: dict[str, TopicStatistics] = {}
+    topics: dict[str, TopicStatistics] = {}  # each of these listeners adds what comes
     if address.kind == "opc.tcp":
         from heliograph.serving.brokers.opcua import Listener
 
         asyncio.run(Listener(topics).listen(address, seconds))
     elif address.kind == "mqtt":
         _listen_mqtt(address, seconds, topics)
-    elif address.kind != "nats":
-        raise fail(f"broker {address}", "mqtt, nats or opc.tcp, of which topics can be listed", address.kind)
-    else:
+    elif address.kind == "nats":
         asyncio.run(_listen_nats(address, seconds, topics))
+    else:
+        raise fail(f"broker {address}", "mqtt, nats or opc.tcp, of which topics can be listed", address.kind)
     return topics
 
 

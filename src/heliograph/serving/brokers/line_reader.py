@@ -19,7 +19,8 @@ from heliograph.serving.brokers.transport import LOG
 from heliograph.serving.message import LONGEST, Message, Payload, Read, UnreadMessage, read_messages
 from heliograph.simulation.network import Network
 
-OPENS = re.compile(rb"\s*(?:\[(?!.*\]\s*$)|\{\s*$)")  # the first line of a document of JSON that has several
+# The first line of a document of JSON over several lines: it begins with [ and does not end with ], or is { alone.
+OPENS = re.compile(rb"\s*(?:\[(?!.*\]\s*$)|\{\s*$)")
 CLOSES = re.compile(rb"[\]}]")  # the last one, which is not indented
 
 
@@ -61,16 +62,18 @@ class LineReader:
         path = None if path is None else file_path("path", path)
         ignore_unknown = flag("ignore_unknown", ignore_unknown)
         self.source = "standard input" if path is None else str(path)
-        # Readers of the kinds of lines: messages that others make, and the topic of such messages that name none;
-        # messages in our own form; a table.
+        # One reader for each kind of lines. Messages that other programs make, and the topic of those that name none:
         self._translator = translator
         self._topic = None if translator is None else translator.topic_of(path)
+        # Messages in heliograph's own form, and the rows of a table:
         self._own = HeliographMessageReader(network, self.source, ignore_unknown, table=False)
         self._table = TableLineReader(network, translator, path, ignore_unknown)
-        self._is_table: bool | None = None  # known once a message or the names of columns came
-        self._document: list[bytes] | None = None  # lines of a document that has not ended
-        self._number = 0  # of the newest line, for errors
-        self._is_local = False  # whether dates came without a zone
+        # What is known so far: whether the lines are a table (None before the first that tells); the lines of a JSON
+        # document that has begun and not ended; the number of the newest line; whether dates came without a zone.
+        self._is_table: bool | None = None
+        self._document: list[bytes] | None = None
+        self._number = 0
+        self._is_local = False
         # Messages of a file are put in order of arrival; messages of a pipe are passed on as they come.
         self._order = None if path is None else ArrivalOrder(self.source, TIME_STEP not in network.inputs)
 
@@ -115,11 +118,12 @@ class LineReader:
         # `_document`: lines of a document that has begun, else None. `_is_table`: None until a message shows the form.
         if self._document is not None:
             self._document.append(line)
-            return self._read_document_or_lines(self._document) if CLOSES.match(line) else []
+            is_last = CLOSES.match(line) is not None
+            return self._read_document_or_lines(self._document) if is_last else []
         if self._is_table is None and OPENS.match(line):
             self._document = [line]
             return []
-        if len(line) > LONGEST:
+        if len(line) > LONGEST:  # the service refuses it
             return [line]
         (read,) = read_messages([line])
         if not isinstance(read, str | UnreadMessage):
@@ -129,7 +133,7 @@ class LineReader:
         return [payload for message in messages for payload in self._interpret_message(message, read)]
 
     def _read_document_or_lines(self, lines: list[bytes]) -> list[Payload]:
-        """Return the messages of a JSON document of several lines, or else of each line by itself."""
+        """Return the messages of a JSON document of several lines; of each line by itself if they are no document."""
         self._document = None
         with suppress(InputError):
             messages = parse_message_document(b"\n".join(lines), self.source)
@@ -155,13 +159,13 @@ class LineReader:
         """
         if isinstance(message, InputError):
             return [str(message)]
-        own = message.topic is None and is_own_message(message.content)
-        if self._translator is not None and not own:
+        is_own = message.topic is None and is_own_message(message.content)
+        if self._translator is not None and not is_own:
             self._is_table = False
             return [*self._translator.decode(message, self._topic)]
         if read is None:
             (read,) = read_messages([json.dumps(message.content).encode()])
-        if not own:
+        if not is_own:  # nobody knows its form: `read` says why it is no message
             return [read]
         self._is_table = False
         if not isinstance(read, str | UnreadMessage):

@@ -46,13 +46,16 @@ class Mqtt:
         self._reader, self._writer = _Reader(address, part, translator), _Writer(address)
 
     async def receive(self) -> Batch | None:
+        """Wait for messages, and return those that are there; they are acknowledged after the commit."""
         return await self._reader.receive()
 
     async def publish(self, outputs: Sequence[Output]) -> None:
+        """Publish outputs, in order; return when the broker has confirmed those that have a number."""
         for begin in range(0, len(outputs), MOST):
             await asyncio.to_thread(self._writer.publish, outputs[begin : begin + MOST])
 
     async def close(self) -> None:
+        """End both connections."""
         await asyncio.gather(asyncio.to_thread(self._reader.close), asyncio.to_thread(self._writer.close))
 
 
@@ -65,8 +68,8 @@ class Connection:
         `identity`: name of the session that the broker keeps while nobody reads, whose messages are acknowledged one by
         one; "" for no session.
         """
-        self.address, self.open = address, True
-        self.changed = threading.Condition()
+        self.address, self.open = address, True  # open: until `close`
+        self.changed = threading.Condition()  # for threads that wait for the broker, or for room for messages
         session = bool(identity)
         client = Client(
             CallbackAPIVersion.VERSION2, identity, clean_session=not session, protocol=MQTTv311, manual_ack=session
@@ -127,10 +130,12 @@ class _Reader(Connection):
     def __init__(self, address: Address, part: Part, translator: Translator | None):
         """Connect, in order to read one part of the plants' messages, and the topics of the translator's sources."""
         super().__init__(address, f"{address.topic.replace('/', '-')}-part-{part.number}-of-{part.of}")
-        self._topics_below = f"{part.number}/#" if part.of > 1 else "#"
-        self._loop, self._some_held = asyncio.get_running_loop(), asyncio.Event()
+        # Topics to read: below the service's own, those of the part (# is the wildcard for all); those of the sources.
         self._prefix, self._translator = f"{address.topic}/in/", translator
+        self._topics_below = f"{part.number}/#" if part.of > 1 else "#"
+        # Messages that wait for `receive`. The client's thread adds them, and sets the event in the service's loop.
         self._held: deque[HeldMessage] = deque()
+        self._loop, self._some_held = asyncio.get_running_loop(), asyncio.Event()
         self._connection = 0  # counts connections and their ends: a message is acknowledged in its own only
         self.client.on_message = self._hold_message
         self.start()
@@ -138,10 +143,10 @@ class _Reader(Connection):
     async def receive(self) -> Batch:
         """Wait for messages, and return those that the service reads; acknowledging the batch acknowledges them all."""
         batch, payloads = list[HeldMessage](), list[Payload]()
-        # Wait until there are messages that the service reads: `_some_held` may be set although the batch before took
-        # all, and messages of topics that no source reads are acknowledged at once.
+        # Wait until there are messages that the service reads. A batch may have none: `_some_held` may be set although
+        # the batch before took all, and messages of topics that no source reads are acknowledged at once.
         while not payloads:
-            self._acknowledge(batch)
+            self._acknowledge(batch)  # the last batch, without anything to read; empty at first
             await self._some_held.wait()
             batch = self._take_held()
             payloads = [payload for held in batch for payload in self._read_payloads(held.message, held.arrival)]
@@ -216,7 +221,7 @@ class _Writer(Connection):
         self.start()
 
     def publish(self, outputs: Sequence[Output]) -> None:
-        """Publish outputs, and return when the broker has confirmed all numbered ones; provisional ones may be lost."""
+        """Publish outputs, and return when the broker has confirmed all numbered ones; others may be lost."""
         to_confirm = set()
         for output in outputs:
             # With quality of service 0, a message is sent once and not confirmed.

@@ -61,14 +61,16 @@ class Nats:
     def __init__(self, address: Address, part: Part = WHOLE, translator: Translator | None = None):
         """Prepare to serve one part of the plants through the server at `address`; the first call connects."""
         self.address, self.part, self._translator = address, part, translator
-        self.topic = address.topic.replace("/", ".")
-        self.stream = self.topic.replace(".", "-")
-        # The server's stream of messages and its reader, None until there is a connection.
+        self.topic = address.topic.replace("/", ".")  # NATS separates the words of a subject by dots
+        self.stream = self.topic.replace(".", "-")  # the server's name of our stored messages
+        # The connection; what stores messages on the server; what reads them. None until there is a connection.
         self._client = Client()
         self._server: JetStreamContext | None = None
         self._reader: JetStreamContext.PullSubscription | None = None
-        # The consumer's name, how many of its messages were read, and the number of the last acknowledged message.
-        self._name, self._read, self._acknowledged = "", 0, 0
+        # The server's record of our reading, a consumer: its name, and how many of its messages were read.
+        self._name, self._read = "", 0
+        self._acknowledged = 0  # number in the stream of the last acknowledged message
+        # Waits between attempts; the lock keeps reading and publishing from connecting both at once.
         self._retry, self._opening = Retry(str(address)), asyncio.Lock()
 
     async def receive(self) -> Batch | None:
@@ -77,7 +79,7 @@ class Nats:
             raise_if_cancelled()
             reader = await self._repeat_while_away(self._open_reader)
             messages = await self._fetch(reader)
-            # None where none came meanwhile, or the connection broke, which `_open_reader` sees.
+            # There are none if none came meanwhile, or if the connection broke: `_open_reader` then makes a new one.
             if not messages or self._has_gap(messages):
                 continue
             payloads = [payload for message in messages for payload in self._read_payloads(message)]
@@ -132,10 +134,12 @@ class Nats:
             await last.ack_sync()
 
     async def publish(self, outputs: Sequence[Output]) -> None:
+        """Publish outputs, in order; return when the server has stored those that have a number."""
         for begin in range(0, len(outputs), MOST):
             await self._repeat_while_away(partial(self._publish_some, outputs[begin : begin + MOST]))
 
     async def close(self) -> None:
+        """End the connection, if there is one."""
         if self._client.is_connected:
             with contextlib.suppress(*AWAY):
                 await asyncio.wait_for(self._client.close(), WAIT)
@@ -232,9 +236,9 @@ class Nats:
             raise TakenOverError(f"{self.address}, part {self.part.number}: expected one reader, another took over")
         # Begin after the last message that any reader acknowledged, ours or an earlier one; at the newest at most. A
         # stream without consumers was made anew, so our old position means nothing there.
-        by_others = [each.ack_floor.stream_seq for each in consumers if each.ack_floor is not None]
-        by_us = self._acknowledged if consumers else 0
-        self._acknowledged = min(max([by_us, *by_others]), newest)
+        acknowledged_there = [each.ack_floor.stream_seq for each in consumers if each.ack_floor is not None]
+        acknowledged_by_us = self._acknowledged if consumers else 0
+        self._acknowledged = min(max([acknowledged_by_us, *acknowledged_there]), newest)
         # Make the new consumer before the old ones are removed, so that there is always one.
         self._name, self._read = prefix + uuid.uuid4().hex[:12], 0
         await server.add_consumer(self.stream, self._configure_consumer())
@@ -269,6 +273,7 @@ class Nats:
             ValueError: the stream exists with another number of parts.
         """
         source, parts = f"{self.topic}.in.*", self.part.of
+        # In the server's notation: TOPIC.in.PLANT becomes TOPIC.in.PART.PLANT, with the part by a hash of the plant.
         target = f"{self.topic}.in.{{{{partition({parts},1)}}}}.{{{{wildcard(1)}}}}"
         transform = SubjectTransform(source, target) if parts > 1 else None
         subjects = [source, *self._source_subjects]

@@ -79,6 +79,7 @@ def read_reporting(url: str, variables: Sequence[str]) -> dict[str, Reporting]:
     names = [text("variable", name) for name in items("variables", variables, "identifiers")]
 
     async def read_rules() -> dict[str, Reporting]:
+        """Connect, and return the rule of each variable in `names`."""
         async with Client(url, timeout=WAIT) as client:
             return {name: await _read_rule(_find_node(client, name)) for name in names}
 
@@ -111,7 +112,8 @@ async def _read_deadband(owner: Node, node: Node) -> float | None:
     deviation = await _read_property(owner, "ExceptionDeviation")
     if deviation is None:
         return None
-    kind, bounds = await _read_property(owner, "ExceptionDeviationFormat"), await _read_property(node, "EURange")
+    kind = await _read_property(owner, "ExceptionDeviationFormat")
+    bounds = await _read_property(node, "EURange")  # the least and greatest value of normal operation
     if kind in (None, ABSOLUTE):
         return float(str(deviation))
     if int(str(kind)) == OF_RANGE and isinstance(bounds, ua.Range):
@@ -128,7 +130,13 @@ class OpcUa:
     """
 
     def __init__(self, address: Address, translator: Translator, target: int = 1):
-        """Prepare to read the server's variables that the sources name; outputs go to the file descriptor `target`."""
+        """Prepare to read the server's variables that the sources name; the first call of `receive` connects.
+
+        Args:
+            address: the server.
+            translator: reads the variables' changes as messages of the network.
+            target: file descriptor of the outputs; 1 is standard output.
+        """
         self.address, self._translator = address, translator
         self._output, self._retry = Pipe(target=target), Retry(str(address))
         self._changes: asyncio.Queue[Sequence[Payload]] = asyncio.Queue()  # messages of each change, not yet received
@@ -150,9 +158,11 @@ class OpcUa:
                 return Batch(payloads, acknowledge_nothing)
 
     async def publish(self, outputs: Sequence[Output]) -> None:
+        """Write outputs to the file descriptor, a line each."""
         await self._output.publish(outputs)
 
     async def close(self) -> None:
+        """End the connection, if there is one."""
         if self._client is not None:
             with contextlib.suppress(*AWAY):
                 await asyncio.wait_for(self._client.disconnect(), WAIT)
@@ -187,7 +197,7 @@ class OpcUa:
                 await self._retry.wait(error)
 
     async def _subscribe(self) -> None:
-        """Connect, and subscribe to each node of the sources."""
+        """Connect, and subscribe to each variable that the sources name; the server sends its present value first."""
         client = _make_client(self.address)
         await client.connect()
         self._client = client
@@ -231,8 +241,9 @@ class Listener:
         topic, body = _translate_change(node, val, data)
         is_first = topic not in self.topics
         note_payload(self.topics, topic, body, time.time_ns())
-        if is_first:
-            del self.topics[topic].logged[:], self.topics[topic].late[:]
+        if is_first:  # forget the times that were just noted of it
+            statistics = self.topics[topic]
+            del statistics.logged[:], statistics.late[:]  # arrays
 
 
 def _make_client(where: Address) -> Client:

@@ -48,21 +48,21 @@ class Pipe:
     def __init__(self, source: int = 0, target: int = 1, reader: MessageReader | None = None):
         """Prepare to read lines from the descriptor `source` by a reader, and to write to the descriptor `target`."""
         self.source, self.target, self._reader = source, target, reader
-        self._rest = b""  # the beginning of a line that has not ended
-        self._skipping = False  # whether the rest of a line is skipped, since the line is too long
-        self._said = False  # whether there was a warning of bytes that could not be unpacked
-        self._newline: bytes | None = None  # the bytes that end a line; None until they are known
+        self._lines = _LineSplitter()
+        self._has_warned = False  # that bytes could not be unpacked
+        # Unpacks bytes that are packed, and decodes UTF-16.
         self._text = TextStream("standard input" if reader is None else reader.source)
 
     async def receive(self) -> Batch | None:
         """Wait for lines of standard input, and return their messages; None at its end."""
         while True:
-            # What is unpacked goes on as long as the bytes read before have more in them.
+            # Packed bytes that were read before may have more text in them: then no more bytes are waited for.
             data, ended = b"", False
             if not self._text.has_more:
                 data = await self._wait_for_bytes()
                 ended = not data
-            lines = self._split_lines(self._text.feed(data, ended), ended and not self._text.has_more)
+            text = self._text.feed(data, ended)
+            lines = self._lines.split(text, ended and not self._text.has_more)
             payloads: list[Payload] = list(lines) if self._reader is None else self._reader.read(lines)
             if ended:
                 payloads += [] if self._reader is None else self._reader.end()
@@ -81,8 +81,8 @@ class Pipe:
 
     def _warn_if_broken(self) -> None:
         """Warn, once, that what came (`_text`, which may be compressed) could not be unpacked to its end."""
-        if self._text.broken and not self._said:
-            self._said = True
+        if self._text.broken and not self._has_warned:
+            self._has_warned = True
             LOG.warning("%s", self._text.broken)
 
     def _read_available(self) -> bytes:
@@ -99,29 +99,6 @@ class Pipe:
             data += next_bytes
         return data
 
-    def _split_lines(self, data: bytes, ended: bool) -> list[bytes]:
-        """Return the lines that are complete with these bytes; at the end of the file, also the incomplete last one.
-
-        Of a line longer than LONGEST one byte more is returned than is allowed, so that it is refused; its rest is
-        skipped.
-        """
-        # Lines end with a newline (a carriage return before it is blank), or with a carriage return where there is no
-        # newline; which, is known once something follows.
-        if self._newline is None and re.search(rb"[\r\n].", data, re.DOTALL):
-            self._newline = b"\n" if b"\n" in data else b"\r"
-        *lines, rest = (self._rest + data).split(self._newline or b"\n")
-        if ended:
-            lines, rest = [*lines, rest], b""
-        if self._skipping and lines:
-            del lines[0]
-            self._skipping = False
-        if len(rest) > LONGEST:
-            if not self._skipping:
-                lines.append(rest[: LONGEST + 1])
-            rest, self._skipping = b"", True
-        self._rest = rest
-        return [line for line in lines if line.strip()]
-
     async def publish(self, outputs: Sequence[Output]) -> None:
         """Write outputs to standard output, a line each, waiting while the pipe is full."""
         rest = memoryview(b"".join([output.body + b"\n" for output in outputs]))
@@ -134,6 +111,50 @@ class Pipe:
 
     async def close(self) -> None:
         """Do nothing: whoever opened the files closes them."""
+
+
+class _LineSplitter:
+    """Cuts bytes that come in pieces into lines.
+
+    Lines end with a newline, or, where there is none, with a carriage return. Of a line longer than LONGEST one byte
+    more than that is returned, so that its reader refuses it, and the rest of it is skipped.
+    """
+
+    def __init__(self) -> None:
+        """Begin before the first byte."""
+        self._rest = b""  # the beginning of a line that has not ended
+        self._newline: bytes | None = None  # the byte that ends lines; None until it is known
+        self._is_skipping = False  # whether the present line was too long, so that its rest is skipped
+
+    def split(self, data: bytes, ended: bool) -> list[bytes]:
+        """Return the lines that are complete with these bytes, but for blank ones.
+
+        `ended`: no more bytes will come, so that the last line needs no end.
+        """
+        if self._newline is None:
+            self._newline = self._find_newline(self._rest + data)
+        *lines, rest = (self._rest + data).split(self._newline or b"\n")
+        if ended:
+            lines, rest = [*lines, rest], b""
+        if self._is_skipping and lines:  # the first of these is the end of the line that was too long
+            del lines[0]
+            self._is_skipping = False
+        if len(rest) > LONGEST:
+            if not self._is_skipping:
+                lines.append(rest[: LONGEST + 1])
+            rest, self._is_skipping = b"", True
+        self._rest = rest
+        return [line for line in lines if line.strip()]
+
+    def _find_newline(self, data: bytes) -> bytes | None:
+        """Return the byte that ends lines, or None as long as it is not known.
+
+        It is known once something follows a newline or a carriage return, since a newline may follow a carriage return.
+        A carriage return before a newline is blank, and counts to its line.
+        """
+        if re.search(rb"[\r\n].", data, re.DOTALL) is None:
+            return None
+        return b"\n" if b"\n" in data else b"\r"
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from heliograph.numerics.types import Float
 from heliograph.simulation.network import Network
 
 SAME = 1e-3  # share by which a time step may differ from the difference of two times, which are rounded
-FAR = 1e12  # a mean delay of more is no time
+FAR = 1e12  # a delay of more is no time
 DELAY = "delay"  # the column of a trace: seconds or steps on the way, nan where a message was lost
 
 
@@ -69,7 +69,7 @@ def events_of_recording(table: Recording, network: Network) -> tuple[list[Event]
     steps = TIME_STEP not in network.inputs
     time = (table.time - origin).astype(np.int64) / 1e9 if dated else np.asarray(table.time, dtype=float)
     time = np.arange(float(len(time))) if steps else time
-    # The time step is no input of messages: they say times, which must agree with it.
+    # The time step is no input of messages: they say times, which must agree with it. `given`: the other inputs.
     given = [i for i, name in enumerate(network.inputs) if name != TIME_STEP]
     if not steps:
         check_time_steps(
@@ -113,7 +113,7 @@ def row_events(
     one for each node's measurement.
 
     Args:
-        numbers: running numbers of the rows, from 0.
+        numbers: running numbers of the rows, from 0; they become the running counts of the events.
         time: the times of the rows: steps, or seconds.
         inputs: the plant's inputs without the time step dt (rows, inputs).
         measurements: {node: values (rows, received)}, NaN where a value did not arrive.
@@ -149,7 +149,7 @@ def simulate_link(events: Sequence[Event], link: Link, seed: int) -> list[Event]
     """
     instance("link", link, Link, "a Link")
     events = items("events", events, "events")
-    chance = np.random.default_rng(check_seed("seed", seed))
+    random = np.random.default_rng(check_seed("seed", seed))
     loss, duplicates = scalar("loss", link.loss, 0, 1), scalar("duplicates", link.duplicates, 0, 1)  # probabilities
     scalar("delay", link.delay, 0, FAR)
     after_loss, after_success = _find_loss_probabilities(loss, scalar("run", link.run, 1))
@@ -159,11 +159,11 @@ def simulate_link(events: Sequence[Event], link: Link, seed: int) -> list[Event]
             arriving.append(_delay_event(event, 0.0))
             continue
         # The first state of the chain is drawn from the stationary law.
-        lost_before = lost.get(event.node, chance.random() < loss)
-        is_lost = chance.random() < (after_loss if lost_before else after_success)
+        lost_before = lost.get(event.node, random.random() < loss)
+        is_lost = random.random() < (after_loss if lost_before else after_success)
         lost[event.node] = is_lost
-        copies = 0 if is_lost else 1 + (chance.random() < duplicates)
-        arriving += [_delay_event(event, chance.exponential(link.delay)) for _ in range(copies)]
+        copies = 0 if is_lost else 1 + (random.random() < duplicates)
+        arriving += [_delay_event(event, random.exponential(link.delay)) for _ in range(copies)]
     return _sort_events(arriving)
 
 
@@ -200,7 +200,7 @@ def delay_as_traced(events: Sequence[Event], trace: Path) -> list[Event]:
         trace: a file with a column `delay`, in the unit of time of the events; NaN where a message was lost.
 
     Raises:
-        ValueError: no column `delay`, or a negative one.
+        ValueError: no column `delay`, a negative one, or one of more than 1e12, such as an infinite one.
     """
     events, trace = items("events", events, "events"), file_path("trace", trace)
     # Read the delays, and check them.
@@ -210,6 +210,9 @@ def delay_as_traced(events: Sequence[Event], trace: Path) -> list[Event]:
     delays = np.asarray(columns[DELAY], dtype=float)
     if np.any(delays < 0):
         raise fail(f"trace {trace}, column {DELAY!r}", "no negative number", float(np.nanmin(delays)))
+    if np.any(delays > FAR):  # infinite too: no message could state such an arrival
+        raise fail(f"trace {trace}, column {DELAY!r}", f"at most {FAR:g}; nan where a message was lost",
+                   float(np.nanmax(delays)))  # fmt: skip
     # Messages are delayed or lost, inputs arrive at once.
     sent = [event for event in events if event.node != INPUTS]
     inputs = [event for event in events if event.node == INPUTS]
@@ -238,8 +241,15 @@ def encode_messages(events: Sequence[Event], plant: str, origin: np.datetime64 |
 
 
 def encode_event(event: Event, plant: str, origin: np.datetime64 | None) -> dict[str, object]:
-    """Return an event as the fields of a message without its arrival; NaN becomes null. `origin`: date of time 0."""
-    return ({"plant": plant} if plant else {}) | {
+    """Return an event as the fields of a message without its arrival; NaN becomes null.
+
+    Args:
+        event: the event.
+        plant: name of the plant; "" leaves the field out.
+        origin: date of time 0; None if times are numbers.
+    """
+    name = {"plant": plant} if plant else {}
+    return name | {
         "node": event.node,
         "sequence": int(event.sequence),
         "time": _format_time(event.time, origin),

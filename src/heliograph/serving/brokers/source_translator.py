@@ -55,9 +55,9 @@ class Translator:
         # `_alone` is the only topic, if there is just one and it is no pattern (with the wildcards + or #).
         is_alone = len(topics) == 1 and not {"+", "#"} & set(topics[0].split("/"))
         self._alone = topics[0] if is_alone else None
-        # How many readings came by plant and node, and how many stored messages without a date were left out.
-        self._counts, self._stored = Counter[tuple[str, str]](), 0
-        # For plants and nodes without a running count: the values of their newest times.
+        self._counts = Counter[tuple[str, str]]()  # by (plant, node), how many readings came
+        self._stored = 0  # how many messages that a broker had stored were left out, as they have no date of their own
+        # {(plant, node, time): the values of the readings there}, of nodes without a running count.
         self._uncounted = OrderedDict[tuple[str, str, int], list[bytes]]()
 
     def read(
@@ -120,15 +120,22 @@ class Translator:
         return self._read_payload(name, message.content, arrival, message.stored, repeatable=False, where=message.where)
 
     def left_out(self) -> list[str]:
-        """Return lines on messages that were not used, such as those of unknown topics, and on oddities in others."""
-        lines, unknown = [], +self.sources.unknown  # counts by topic; the sign + leaves out zeros
+        """Return lines on messages that were not used, and on oddities in others, for the end of a run.
+
+        Messages are not used if their topic is not among the sources; or if a broker had stored them, and only their
+        arrival would date them. Oddities are what the sources noted on the way, several senders under one name, and a
+        field of the sources that no message had.
+        """
+        lines = list[str]()
+        unknown = +self.sources.unknown  # {topic: how many messages}; the sign + of a Counter leaves out zeros
         if unknown:
             named = ", ".join(f"{topic} ({count})" for topic, count in unknown.most_common(LISTED))
             more = "" if len(unknown) <= LISTED else f" and {len(unknown) - LISTED} more"
             lines.append(f"topics that are not among the sources: {named}{more}")
         lines += [*self.sources.notes, *self.sources.senders.describe_several_senders()]
-        if said := self.sources.describe_absent_field():
-            lines.append(f"a field that no message had: {said}")
+        absent_field = self.sources.describe_absent_field()
+        if absent_field:
+            lines.append(f"a field that no message had: {absent_field}")
         if self._stored:
             lines.append(f"{self._stored} stored messages were left out: without time= they have no date")
         return lines
@@ -186,7 +193,11 @@ class Translator:
     ) -> UnreadMessage | str:
         """Return why a message could not be read, together with its node, count and time if these could be read.
 
-        `known`: when it arrived, None if that is not known. `repeatable`: whether a copy of it may come again.
+        Args:
+            topic: topic from which it came, for errors.
+            unread: the error, and `counted`, what was read in spite of it; None if nothing was.
+            known: when it arrived, None if that is not known.
+            repeatable: whether a copy of it may come again.
         """
         why = str(unread.error)
         if unread.counted is None:
@@ -215,7 +226,7 @@ class Translator:
             raise fail(f"{topic}, plant", expected, show_value(reading.plant))
         arrival = datetime.now(UTC) if known is None else known
         # A copy of the node's last message, repeated by a gateway, gets the time of the original.
-        nanoseconds = None if known is None else (known - EPOCH) // MICROSECOND * 1000
+        nanoseconds = None if known is None else (known - EPOCH) // MICROSECOND * 1000  # since 1970
         reading = self.sources.date_copy_as_original(reading, nanoseconds)
         time = self._date_reading(topic, reading, arrival, is_known=known is not None)
         # A message from a log says when it arrived. One that comes now says so only if its time is later than now: it
@@ -238,8 +249,16 @@ class Translator:
     def _date_reading(self, topic: str, reading: Reading, arrival: datetime, is_known: bool) -> datetime | float:
         """Return when a reading was measured, as a date or a number of steps; without a time, return its arrival.
 
-        A reading's time is in nanoseconds since 1970, or counts steps. ValueError, which names the topic, is raised if
-        a date is more than a year before a known arrival (`is_known`).
+        A reading's time is in nanoseconds since 1970, or counts steps.
+
+        Args:
+            topic: topic from which it came, for errors.
+            reading: the reading.
+            arrival: when it arrived.
+            is_known: whether that is known, and not the present in its place.
+
+        Raises:
+            ValueError: a date more than a year before a known arrival: the sender's clock was never set.
         """
         if reading.time is None:
             return arrival

@@ -50,7 +50,8 @@ def make_state_messages(topic: str, states: Sequence[str], body: bytes) -> Itera
     """Yield a message for each state of each filter of an estimate: value, deviation, dead, and time.
 
     The topic is TOPIC/state/PLANT/NODE/FILTER/STATE. `value` and `deviation` are numbers or null. `dead` is 1 if the
-    sender of the node is dead, else 0. `time` is that of the estimate; a date is in seconds since 1970.
+    sender of the node is dead, which means silent for longer than it may be, else 0. `time` is that of the estimate; a
+    date is in seconds since 1970.
 
     Args:
         topic: the service's topic.
@@ -60,7 +61,8 @@ def make_state_messages(topic: str, states: Sequence[str], body: bytes) -> Itera
     estimate = from_json(body)
     moment = estimate["time"]
     time = parse_instant(moment).timestamp() if isinstance(moment, str) else moment
-    dead = _read_dead_senders(estimate)
+    dead = _read_dead_senders(estimate)  # {node: 1 or 0}
+    # For each filter and each state i: the state with its topic, i, and the filter's part of the estimate.
     for published, i, message in _iterate_states(topic, states, estimate):
         covariance = message["covariance"]
         variance = None if covariance is None else covariance[i][i]
@@ -88,12 +90,12 @@ def make_discovery_messages(topic: str, states: Sequence[str], body: bytes, pref
     device = {"identifiers": [f"{topic.replace('/', '-')}-{encode_name(plant).replace('%', '_')}"],
               "name": plant or topic, "manufacturer": "heliograph"}  # fmt: skip
     nodes_with_senders = _read_dead_senders(estimate).keys()
-    for published, i, _ in _iterate_states(topic, states, estimate):
+    for published, i, _ in _iterate_states(topic, states, estimate):  # i: the state's index
         common = {"state_topic": published.topic, "availability_topic": availability_topic(topic), "device": device}
         for sensor in _list_sensors(published, unit_of(states[i]), published.node in nodes_with_senders):
             identity = f"{published.identity}-{sensor.key}"
             named = {"name": sensor.name, "unique_id": identity, "value_template": f"{{{{ value_json.{sensor.key} }}}}"}
-            content = json.dumps(named | common | sensor.settings).encode()
+            content = json.dumps(named | common | sensor.settings).encode()  # in the words of Home Assistant
             yield StateMessage(f"{prefix}/{sensor.kind}/{identity}/config", content)
 
 
@@ -125,7 +127,7 @@ def _list_sensors(published: _PublishedState, unit: str | None, has_sender: bool
 
 
 def _read_dead_senders(estimate: Mapping[str, Any]) -> dict[str, int]:
-    """Return 1 for each node whose sender is dead, 0 for each that lives, by node with such a sender."""
+    """Return {node: 1 if its sender is dead, else 0}, of nodes with senders whose silence says something."""
     return {node: int(sender["dead"]) for node, sender in estimate.get("senders", {}).items()}
 
 

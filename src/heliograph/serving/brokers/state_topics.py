@@ -84,10 +84,10 @@ class _StateWriter(Connection):
     def __init__(self, topics: StateTopics, states: Sequence[str]):
         """Connect to the broker, to publish the states of these names; the last will says "offline"."""
         super().__init__(topics.address, "")
-        # `_announced`: topics that Home Assistant knows. `_newest`: each plant's newest estimate, to publish it again;
-        # the lock guards it.
-        self._topics, self._states, self._announced = topics, states, set[str]()
-        self._newest, self._one_at_a_time = dict[str | None, bytes](), threading.Lock()
+        self._topics, self._states = topics, states
+        self._announced = set[str]()  # topics of sensors that Home Assistant was told of
+        self._newest = dict[str | None, bytes]()  # each plant's newest estimate, to publish it again
+        self._one_at_a_time = threading.Lock()  # the client's thread and the service's use these two
         self._available = availability_topic(topics.address.topic)
         # The last will: what the broker says for this client when its connection breaks.
         self.client.will_set(self._available, OFFLINE, AT_LEAST_ONCE, retain=True)

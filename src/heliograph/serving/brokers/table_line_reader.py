@@ -37,7 +37,7 @@ class TableLineReader:
     """
 
     def __init__(self, network: Network, translator: Translator | None, path: Path | None, ignore_unknown: bool):
-        """Hold the network and the translator of its sources; a table without a path comes from standard input."""
+        """Begin before the header, which decides how rows are read. The arguments are the class's."""
         self._network, self._translator, self._path, self._ignore = network, translator, path, ignore_unknown
         self._source = "standard input" if path is None else str(path)
         self._text = CsvReader(self._source, path, marked=translator is not None)
@@ -88,11 +88,11 @@ class TableLineReader:
         They are events in heliograph's own form (of one node, with its name and count), rows that sources map, or rows
         of times with the measurements of all nodes.
         """
-        if {NODE, SEQUENCE} <= set(header):
+        if {NODE, SEQUENCE} <= set(header):  # events
             return IndependentRowReader(lambda row: read_own_event(self._own, row.where, convert_cells(row)))
         translator = self._translator
         if translator is not None:
-            topic = translator.topic_of_rows(self._path, header)
+            topic = translator.topic_of_rows(self._path, header)  # None: the rows name their topics, or none is known
             if topic is not None or TOPIC in header:
                 return IndependentRowReader(
                     lambda row: translator.decode(make_message_of_row(row.where, convert_cells(row)), topic)
@@ -122,7 +122,14 @@ class TimeRowReader:
     """
 
     def __init__(self, network: Network, header: list[str], text: CsvReader, ignore_unknown: bool):
-        """Prepare to read rows of a table with these columns; `text` reads them from a file or a pipe."""
+        """Prepare to read rows of a table.
+
+        Args:
+            network: the network.
+            header: the names of the table's columns.
+            text: reads the table's text; its path is None if it is a pipe.
+            ignore_unknown: whether columns that the network does not know are left out.
+        """
         self._network, self._steps = network, TIME_STEP not in network.inputs  # `_steps`: whether time counts steps
         self._rows = RowReader(network, text.source, strict=False, ignore_unknown=ignore_unknown)
         self._columns = CsvColumnReader(text.source, text.path, self._rows.only, strict=False)
@@ -139,24 +146,38 @@ class TimeRowReader:
         return self._columns.local
 
     def read(self, rows: Sequence[CsvRow | InputError]) -> list[Payload]:
-        """Return the messages of rows, the same as a replay of these rows makes, and errors for rows that are refused.
+        """Return the messages of rows, the same as a replay of these rows makes, and the errors of refused rows.
 
-        Rows of a whole file are held until its end: then only the errors are returned here.
+        Rows of a pipe become messages at once. Rows of a file are only collected here, since they can be put in order
+        at its end (`end`): then the errors alone are returned.
         """
-        cells = self._rows.read_cells(self._columns.read(rows))
-        refused, self._rows.refused = [str(error) for error in self._rows.refused], []
+        cells = self._rows.read_cells(self._columns.read(rows))  # columns by name, of the rows that are not refused
+        errors = self._take_errors()
+        if not len(cells.numbers):
+            return errors
+        if self._is_file:
+            self._cells.append(cells)
+            return errors
+        return [*self._make_messages(cells), *errors]
+
+    def _take_errors(self) -> list[Payload]:
+        """Return why rows were refused since the last call, as texts that stand for their messages."""
+        errors = [str(error) for error in self._rows.refused]
+        self._rows.refused = []
+        return [*errors]
+
+    def _make_messages(self, cells: RecordingRows) -> list[Payload]:
+        """Return the messages of rows of a pipe, lines of JSON; the next rows follow these."""
         count = len(cells.numbers)
-        if not count or self._is_file:
-            self._cells += [cells] if count else []
-            return [*refused]
         time = self._time_of_messages(cells.time, cells.numbers)
         if TIME_STEP in cells.inputs:
             self._check_time_steps(cells, time)
         inputs = np.stack([cells.inputs[name] for name in self._given], axis=1) if self._given else np.zeros((count, 0))
-        events = row_events(cells.numbers - 1, time, inputs, cells.measurements, self._before, self._steps)
+        numbers_from_0 = cells.numbers - 1
+        events = row_events(numbers_from_0, time, inputs, cells.measurements, self._before, self._steps)
         lines = [json.dumps(encode_event(event, "", self._origin)).encode() for event in events]
         self._before = float(time[-1])
-        return [*lines, *refused]
+        return [*lines]
 
     def _check_time_steps(self, cells: RecordingRows, time: np.ndarray) -> None:
         """Raise ValueError if a row's time step is not the time since the previous row; `time` holds the rows' times.
@@ -164,14 +185,12 @@ class TimeRowReader:
         If there was a row before these, the first step is checked too. The check does not use that row's own step and
         number, so those of the first row stand in their place.
         """
-        before = [] if self._before is None else [self._before]
-        steps = cells.inputs[TIME_STEP]
-        check_time_steps(
-            np.concatenate([steps[: len(before)], steps]),
-            np.concatenate([before, time]),
-            np.concatenate([cells.numbers[: len(before)], cells.numbers]),
-            self._rows.source,
-        )
+        steps, numbers = cells.inputs[TIME_STEP], cells.numbers
+        if self._before is not None:
+            steps = np.concatenate([steps[:1], steps])
+            time = np.concatenate([[self._before], time])
+            numbers = np.concatenate([numbers[:1], numbers])
+        check_time_steps(steps, time, numbers, self._rows.source)
 
     def end(self) -> list[Payload]:
         """Return the messages of a file's rows, after all have come, and then why rows were refused.
@@ -205,7 +224,8 @@ class TimeRowReader:
 def read_own_event(reader: HeliographMessageReader, where: str, content: dict[str, object]) -> list[Payload]:
     """Return the messages of an event in heliograph's own form: its measurement, and its inputs if it has any.
 
-    If one cannot be read, its error stands there: as a text, or with its count and time if these are known.
+    In the place of one that cannot be read its error is returned: with its node, count and time if these are known,
+    else as a text.
     """
     try:
         readings_and_arrivals = reader.read(where, content)
@@ -217,6 +237,8 @@ def read_own_event(reader: HeliographMessageReader, where: str, content: dict[st
             payloads.append(_make_message(reader, reading, arrival))
         elif reading.counted is not None:
             payloads.append(UnreadMessage(_make_message(reader, reading.counted, arrival), str(reading.error)))
+        else:
+            payloads.append(str(reading.error))
     return payloads
 
 

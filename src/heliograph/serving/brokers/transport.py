@@ -68,7 +68,7 @@ async def acknowledge_nothing() -> None:
 
 LOG = logging.getLogger("heliograph.serving")
 
-FIRST, LONGEST = 0.25, 30.0  # seconds
+FIRST, LONGEST = 0.25, 30.0  # seconds of the first wait between attempts to connect, and of the longest
 
 
 def raise_if_cancelled() -> None:
@@ -97,7 +97,7 @@ class Retry:
     """Waits that double, each shortened at random by up to a half so that processes do not come back all at once."""
 
     def __init__(self, what: str):
-        """Begin with the shortest wait; `what` is done again after it, in the words of a log."""
+        """Begin with the shortest wait; `what` is the name of the server in the log."""
         self.what, self._wait = what, FIRST
 
     async def wait(self, error: Exception) -> None:
@@ -113,7 +113,7 @@ class Retry:
         self._wait = FIRST
 
 
-OFFSET, PRIME = 0x811C9DC5, 0x01000193
+OFFSET, PRIME = 0x811C9DC5, 0x01000193  # the constants of FNV-1a with 32 bits
 
 NAMELESS = "_"  # the word for the plant that has no name
 

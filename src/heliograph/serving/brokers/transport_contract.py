@@ -60,7 +60,10 @@ class _Examination:
         self._numbers = count()  # numbers the messages
 
     async def check_all(self) -> bool:
-        """Check each promise in turn, with one service after another; return whether redelivery keeps the order."""
+        """Check each promise of a transport; return whether messages that come again come in order.
+
+        The transport is opened and closed three times, as by a service that is restarted.
+        """
         # First service: new messages arrive in order, and all are acknowledged.
         async with self._open_transport() as transport:
             await self._start_listening(transport)

@@ -20,18 +20,15 @@ class LastAnswers(Generic[T]):
     """
 
     def __init__(self, lock: threading.Lock, answer: Callable[[str], T], begin: T, most: int = 1):
-        """Hold how a question is answered; no question was asked yet.
-
-        `lock` is held while a batch is taken. `answer` computes the answer to a question, `begin` is the answer if none
-        was computed yet, and `most` is how many answers are kept.
-        """
+        """Hold how a question is answered; no question was asked yet. The arguments are the class's."""
         self.lock, self.answer, self.begin, self.most = lock, answer, begin, most
         self._last: OrderedDict[str, T] = OrderedDict()
 
     def ask(self, question: str = "") -> T:
-        """Return the answer to a question; if a batch holds the lock longer than PATIENCE, return the last answer.
+        """Return the answer to a question, computed now, or the last one if a batch holds the lock for too long.
 
-        `begin` is the answer to a question that was never answered. The answers to the last `most` questions are kept.
+        The longest wait is PATIENCE (1 s), so that a page answers while a long batch is taken. A question that was
+        never answered gets `begin`. The answers to the last `most` questions are kept.
         """
         if self.lock.acquire(timeout=PATIENCE):
             try:

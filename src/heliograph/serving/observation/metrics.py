@@ -14,6 +14,7 @@ from heliograph.serving.observation.answers_between_batches import LastAnswers
 from heliograph.serving.observation.service_watch import ServiceWatch
 
 SHOWN = 50  # plants with metrics of their own; of more the worst
+# Metrics of a filter's test and of an output, by the ends of their names: what Prometheus says they are.
 NIS = {
     "nis": "Normalised innovation squared of what a filter used over its expectation, of a plant's last rows; 1.",
     "nis_low": "Least that is expected of an honest filter.",
@@ -36,9 +37,9 @@ class ServiceMetrics(Collector):
         """Register the metrics of the watched service, and write their text once before the first batch."""
         self.watch = watch
         watch.registry.register(self)
-        text = partial(generate_latest, watch.registry)
-        # This keeps the last text, which is given while a batch takes long.
-        self._texts = LastAnswers(watch.lock, lambda _: text(), text())
+        write_text = partial(generate_latest, watch.registry)
+        # Keeps the last text, which is returned while a batch takes long. It is asked only one question.
+        self._texts = LastAnswers(watch.lock, answer=lambda _: write_text(), begin=write_text())
 
     def collect(self) -> Iterable[Metric]:
         """Yield the current metrics of all services that `watch` observes, as Prometheus asks for them."""
@@ -68,6 +69,7 @@ def _collect_plants(watch: ServiceWatch) -> Iterable[Metric]:
     wrong.add_metric(["refused messages"], sum(bool(item.refused) for item in worst))
     families = [GaugeMetricFamily(f"heliograph_plant_{name}", words, labels=labels) for name, words in NIS.items()]
     dead = GaugeMetricFamily("heliograph_plant_dead_sender", "1: its sender is dead.", labels=["plant", "node"])
+    # A few plants are all shown; of many, those with something wrong.
     names = [name for name, _ in watch.plants()]
     shown = names if len(names) <= SHOWN else [item.plant for item in worst[:SHOWN]]
     for plant in dict.fromkeys(shown):

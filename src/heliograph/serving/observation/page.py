@@ -174,14 +174,20 @@ def send_page_file(request: Request) -> Response:
 
 
 async def _yield_events(watch: ServiceWatch, request: Request, stopped: asyncio.Event) -> AsyncIterator[str]:
-    """Yield the view whenever it has changed, else a comment, so that we notice a reader that has gone."""
-    plant, since, before = request.query_params.get("plant"), 0, None
+    """Yield the page's data as a server-sent event whenever they have changed, else a comment.
+
+    A comment shows whether the reader has gone. Each event has only the chart points that are newer than the last
+    one's, of which `since` is the number. Without a plant in the request, the first plant with points is followed.
+    """
+    plant, since, text_before = request.query_params.get("plant"), 0, None
     while not (stopped.is_set() or await request.is_disconnected()):
         view = await asyncio.to_thread(watch.make_page_data, plant, since)
-        plant, since = view["plant"] if view["points"] else plant, view["newest"]
-        known = json.dumps(view)
-        yield f"data: {known}\n\n" if known != before else ": \n\n"
-        before = known
+        since = view["newest"]
+        if view["points"]:
+            plant = view["plant"]
+        text = json.dumps(view)
+        yield f"data: {text}\n\n" if text != text_before else ": \n\n"
+        text_before = text
         with suppress(TimeoutError):
             await asyncio.wait_for(stopped.wait(), EVERY)
 
@@ -195,17 +201,17 @@ class TokenMiddleware:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer only requests that bring the token, in their address (kept as a cookie then), a cookie or a header."""
-        if scope["type"] != "http" or self.token is None or scope["path"] == HEALTH:
+        if scope["type"] != "http" or self.token is None or scope["path"] == HEALTH:  # health is no secret
             await self.app(scope, receive, send)
             return
         requested = HTTPConnection(scope)
+        in_cookie, in_header = requested.cookies.get("heliograph", ""), _read_bearer_token(requested)
         if self._matches_token(requested.query_params.get("token", "")):
+            # Keep it as a cookie, and lead to the address without it.
             answer: Response = RedirectResponse("/", 303)
             answer.set_cookie("heliograph", self.token, httponly=True, samesite="strict")
             await answer(scope, receive, send)
-        elif self._matches_token(requested.cookies.get("heliograph", "")) or self._matches_token(
-            _read_bearer_token(requested)
-        ):
+        elif self._matches_token(in_cookie) or self._matches_token(in_header):
             await self.app(scope, receive, send)
         else:
             await PlainTextResponse("a token is needed: ?token=", 401)(scope, receive, send)

@@ -44,11 +44,9 @@ class RememberedPlants:
     """
 
     def __init__(self, names: Mapping[tuple[str, str], Sequence[str]]):
-        """Begin without plants; `names` holds the names of the received numbers by (node, filter).
-
-        Each table below is by plant, and the plant with the newest message is last.
-        """
+        """Begin without plants; `names` has the names of the received numbers by (node, filter)."""
         self.count, self._names = 0, names  # `count`: how many points of charts came so far
+        # Each of these is by plant, and the plant with the newest message is last.
         self.points: OrderedDict[str, deque[ChartPoint]] = OrderedDict()
         self.outputs: OrderedDict[str, RecentInnovations] = OrderedDict()
         self.tests: OrderedDict[str, dict[tuple[str, str], RunningNis]] = OrderedDict()
@@ -70,9 +68,9 @@ class RememberedPlants:
         return _move_to_newest(self.outputs, plant, lambda: RecentInnovations(MEMORY, self._names))
 
     def keep_point(self, plant: str, message: Mapping[str, Any]) -> None:
-        """Keep a plant's newest estimates, a message as sent, as a point of its chart, and what silence means.
+        """Keep a plant's newest estimates as a point of its chart, and the status of its senders.
 
-        Of each sender in the message: whether it is dead, that is silent for too long.
+        `message` is an output of the service, read from JSON. A sender is dead if it is silent for longer than it may.
         """
         self.count += 1
         estimates = {
@@ -89,9 +87,10 @@ class RememberedPlants:
                 self.dead_senders[plant] = dead
 
     def keep_crossings(self, plant: str, horizons: Sequence[Mapping[str, Any]]) -> None:
-        """Keep the probabilities that a plant's thresholds are crossed; `horizons` is its newest forecast, as sent.
+        """Keep the probabilities that a plant's thresholds are crossed, in place of the earlier ones.
 
-        They replace the earlier ones. If the forecast has none, the earlier ones are dropped.
+        `horizons` is its newest forecast, as it is published: for each horizon, how far ahead it is, and what each
+        filter says by node and filter.
         """
         crossings = dict[tuple[str, ...], Mapping[str, float]]()  # by node, filter, threshold, how far ahead
         for horizon in horizons:

@@ -11,7 +11,9 @@ from heliograph.model.estimate import Claim
 
 MEMORY = 200  # rows, of which an old one counts 1/e: long enough to judge, short enough to see a change
 FEWEST = 20  # received components before a test is made
-WEIGHED, HALF = ("value", "variance", "weight"), 0.5  # from this weight on a number was used
+# Fields of a filter that weighs what it receives: innovation, its variance, and the weight that it got.
+WEIGHED = ("value", "variance", "weight")
+HALF = 0.5  # from this weight on a number counts as used
 DOUBT = 0.001  # how often an honest filter is outside its band
 
 
@@ -60,7 +62,10 @@ class RunningNis:
         return float(low), float(high)
 
     def explain_doubt(self) -> str | None:
-        """Return in words why the claimed covariance is doubtful, or None if it is not or too few numbers came."""
+        """Return in words why the claimed covariance is doubtful, or None if it is not or too few numbers came.
+
+        It is if the ratio is outside its band; below the band only if the covariance is not claimed as an upper bound.
+        """
         low, high = self.band()
         if self.numbers < FEWEST:
             return None
@@ -76,9 +81,12 @@ class RunningNis:
 def read_nis(message: Mapping[str, Any]) -> tuple[float | None, int]:
     """Return the normalised innovation squared (NIS) of the numbers that a filter used, and how many they are.
 
-    A filter that weighs what it receives has `outputs`: innovation, variance and weight of each number. Its NIS is the
-    sum of innovation^2 / variance over the numbers of weight 1/2 or more, so that outliers do not count. It is None if
-    there are no such numbers.
+    A filter that weighs what it receives says for each number its innovation, variance and weight. Its NIS is the sum
+    of innovation^2 / variance over the numbers of weight 1/2 or more, so that outliers do not count. It is None if
+    there are no such numbers. Of any other filter both stand in the message.
+
+    Args:
+        message: the filter's part of a published estimate: `nis`, `received`, and `outputs` if it weighs.
     """
     outputs = message.get("outputs")
     if message.get("nis") is None or not outputs:

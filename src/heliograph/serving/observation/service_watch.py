@@ -71,37 +71,29 @@ class ServiceWatch:
         names: Mapping[tuple[str, str], Sequence[str]] | None = None,
         uncounted: Collection[str] = (),
     ):
-        """Begin without a service.
+        """Begin without a service; `wrap` adds one. The arguments are the class's.
 
-        The watch collects what pages and metrics show of a running service: tests of filters, counts of messages,
-        delays. A service is added later.
-
-        Args:
-            states: names of the states.
-            title: name of the network.
-            time_unit: unit of times that are numbers.
-            fused: {name of a fusion: (its claim, the (node, filter) pairs that it fuses)}; the claim says what its
-                covariance is.
-            names: names of the received numbers by (node, filter).
-            uncounted: nodes whose messages carry no running count, so that losses cannot be counted.
+        The watch collects what pages and metrics show of running services.
         """
         self.states, self.title, self.time_unit = list(states), title, time_unit
         self.fused, self.uncounted = dict(fused or {}), uncounted
+        self.services: list[WatchableService] = []
         # `lock` is held while a batch of messages is taken, `_noting` while its outputs are recorded. `_batch_started`:
         # when the batch that is being taken began.
         self.lock, self._noting = threading.Lock(), threading.Lock()
         self._batch_started: float | None = None
-        # For all plants together: services, tests of claims (normalised squared innovations), weighed outputs, counts,
-        # troubles, batches.
-        self.services: list[WatchableService] = []
+        # Over all plants: tests of the filters' covariances by (node, filter), the newest innovations of filters that
+        # weigh outputs, counts of messages, durations of batches.
         self.nis: dict[tuple[str, str], RunningNis] = {}
         self.outputs = RecentInnovations(MEMORY, names or {})
-        self.totals, self._overview = CountTotals(), TroubleOverview()
+        self.totals = CountTotals()
+        self._batches = BatchHistograms()
+        # Of each plant: what is wrong with it; and, of those with new messages, the points of charts and tests.
+        self._overview = TroubleOverview()
+        self._memory = RememberedPlants(names or {})
+        # What the services themselves are asked, between two batches; the last answers stand while one is taken.
         no_answers = ServiceAnswers(names=[], links={}, malformed=0, wrong=0)
         self._service_answers = LastAnswers(self.lock, self._ask_services, no_answers, PLANTS)
-        self._batches = BatchHistograms()
-        # For each plant with a new message.
-        self._memory = RememberedPlants(names or {})
 
     @property
     def registry(self) -> CollectorRegistry:
@@ -129,7 +121,10 @@ class ServiceWatch:
             self._record_batch(outputs, last)
 
     def _record_batch(self, outputs: Sequence[Output], last: BatchTimes | None) -> None:
-        """Update times, counts, points and tests by a batch's outputs; call it with `_noting` held."""
+        """Update times, counts, points of charts, and tests by a batch's outputs; call it with `_noting` held.
+
+        `last` has the times of the batch; None where nothing came.
+        """
         if last is not None:
             self._batches.observe(last)
         plants = {output.plant for output in outputs}
@@ -147,18 +142,22 @@ class ServiceWatch:
                     self._test_claims(output.plant, message["estimates"])
 
     def _test_claims(self, plant: str, estimates: Mapping[str, Mapping[str, Any]]) -> None:
-        """Add the NIS (normalised innovation squared) of a plant's newest estimates to the running tests of claims.
+        """Add a plant's newest estimates to the running tests of what filters claim of their covariances.
 
-        The outputs of filters that weigh what they receive are added to the recent innovations. Both go to the plant's
-        own statistics and to those of all plants. `estimates` holds messages by node and filter.
+        A filter's NIS (normalised innovation squared) goes to its test, and of a filter that weighs what it receives
+        each number's innovation to the recent ones. Both go to the plant's own statistics and to those of all plants.
+
+        Args:
+            plant: name of the plant.
+            estimates: published estimates by node and filter.
         """
         tests_of_plant, outputs_of_plant = self._memory.tests_of(plant), self._memory.outputs_of(plant)
         for node, filters in estimates.items():
             for name, message in filters.items():
-                squared, received = read_nis(message)
-                if squared is not None:
+                nis, received = read_nis(message)
+                if nis is not None:
                     for tests in (self.nis, tests_of_plant):
-                        tests.setdefault((node, name), RunningNis(message["claim"])).add(squared, received)
+                        tests.setdefault((node, name), RunningNis(message["claim"])).add(nis, received)
                 if message.get("outputs") and message.get("received"):
                     for outputs in (self.outputs, outputs_of_plant):
                         outputs.add(node, name, message["outputs"])
@@ -195,7 +194,7 @@ class ServiceWatch:
     def list_worst_plants(self) -> list[PlantTroubles]:
         """Return the plants with something wrong, the worst first: doubted filters, dead senders, refused messages.
 
-        Refusals are counted again only for plants that had a message since the last look (`touched`).
+        Refusals are counted again only for plants that had a message since the last call (`touched`).
         """
         refused = dict[str, str]()
         for name, plant in self._iterate_plants(self._overview.touched):
@@ -232,13 +231,17 @@ class ServiceWatch:
         return total
 
     def make_page_data(self, plant: str | None, since: int = 0) -> dict[str, Any]:
-        """Return the data of the page for a plant (None: the one with the newest message), after the point `since`.
+        """Return the data that the page of a plant shows, which its script draws.
 
         While a batch is being taken, as where programs compile, the counts are those before it.
+
+        Args:
+            plant: name of the plant; None for the one with the newest message.
+            since: number of the newest point that the page has already; later points of the charts are returned.
         """
         with self._noting:
             name = self._memory.newest_plant if plant is None else plant
-        # Asked without holding `_noting`, since it may take the other lock.
+        # Asked without holding `_noting`, since it may take the other lock: never both, which could block for ever.
         answers = self._service_answers.ask(name)
         with self._noting:
             # One JSON object; lists are bounded, so that its size does not grow with the plants.
@@ -252,12 +255,18 @@ class ServiceWatch:
                 "time_unit": self.time_unit,
                 "since": since,
                 "malformed": answers.malformed,
-                "all": self.links(),
-                "wrong": answers.wrong,
+                "all": self.links(),  # counts by node, over all plants
+                "wrong": answers.wrong,  # how many plants have something wrong
             } | self._describe_plant(name, since, answers.links)
 
     def _describe_plant(self, plant: str, since: int, links: Mapping[str, dict[str, int]]) -> dict[str, Any]:
-        """Return what the page says of one plant, whose counts by node are `links`, after the point `since`."""
+        """Return what the page says of one plant, which is empty where nothing of it is remembered.
+
+        Args:
+            plant: name of the plant.
+            since: number of a point of its charts: only later points are returned.
+            links: counts of its messages, by node.
+        """
         memory = self._memory
         tests, senders = memory.tests.get(plant, {}), memory.senders.get(plant, {})
         health = memory.outputs[plant].summarise_outputs() if plant in memory.outputs else []
@@ -356,11 +365,13 @@ def watch_of(network: Network, title: str, uncounted: Collection[str] = ()) -> S
     `uncounted`: nodes whose messages carry no count, so that it is not known how many are lost.
     """
     claims = network.claims()
+    # Fusions of estimates: {name: (its claim, the (node, filter) pairs that it fuses)}.
     fused = {
         name: (claims[Network.FUSED][name], [(node, fusion.filter) for node in network.nodes_with(fusion.filter)])
         for name, fusion in network.fused.items()
         if isinstance(fusion, Fusion)
     }
+    # Names of the received numbers by (node, filter); central filters receive those of all nodes.
     names: dict[tuple[str, str], Sequence[str]] = {
         (node, name): receiver.received_names for node, receiver in network.nodes.items() for name in receiver.filters
     }

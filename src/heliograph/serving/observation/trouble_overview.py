@@ -56,15 +56,15 @@ class PlantTroubles(NamedTuple):
 
 
 class TroubleOverview:
-    """Keeps what is wrong with each plant, found anew where a plant has had a message since the last look."""
+    """Keeps what is wrong with each plant; only plants with new messages are examined again."""
 
     def __init__(self) -> None:
-        """Begin without plants: `touched` are those that had a message since the last look."""
-        self.touched = set[str]()
-        self._wrong: dict[str, PlantTroubles] = {}
+        """Begin without plants."""
+        self.touched = set[str]()  # plants that had a message since `list_worst_plants` was last called
+        self._wrong: dict[str, PlantTroubles] = {}  # by plant, of plants with something wrong
 
     def note_change(self, plant: str) -> None:
-        """Note that a plant has had a message, or that its silence has changed."""
+        """Note that a plant has had a message, or that its silence has changed, so that it is examined again."""
         self.touched.add(plant)
 
     def list_worst_plants(
@@ -73,18 +73,21 @@ class TroubleOverview:
         dead: Mapping[str, Sequence[str]],
         refused: Mapping[str, str],
     ) -> list[PlantTroubles]:
-        """Return the plants with something wrong, the worst first.
+        """Return the plants with something wrong, the worst first (`PlantTroubles.severity`).
+
+        Only plants with a message since the last call (`touched`) are examined; of the others the last result stands.
 
         Args:
-            tests: tests of each plant's filters.
-            dead: dead senders of each plant that has one.
+            tests: tests of each plant's filters, which show whether their covariances are doubtful.
+            dead: nodes with a dead sender (silent for longer than it may be) of each plant that has one.
             refused: refused messages of each touched plant, in words.
         """
         for plant in self.touched:
             doubts = tuple(find_doubts(tests.get(plant, {})))
-            wrong = PlantTroubles(plant, tuple(dead.get(plant, ())), doubts, refused.get(plant, ""))
-            if wrong.describe:
-                self._wrong[plant] = wrong
+            troubles = PlantTroubles(plant, tuple(dead.get(plant, ())), doubts, refused.get(plant, ""))
+            lines_on_troubles = troubles.describe  # a property
+            if lines_on_troubles:
+                self._wrong[plant] = troubles
             else:
                 self._wrong.pop(plant, None)
         self.touched.clear()
@@ -98,8 +101,10 @@ def find_doubts(tests: Mapping[Name, RunningNis]) -> Iterable[FilterDoubt]:
     """
     doubts = []
     for (node, name), test in tests.items():
-        # The ratio's standard deviation is sqrt(variance) / mean. Within NEAR of these of 1, it is clearly in its band.
-        if test.numbers < FEWEST or (test.ratio - 1.0) ** 2 * test.mean**2 < NEAR**2 * test.variance:
+        # The standard deviation of the ratio is s = sqrt(variance) / mean. If |ratio - 1| < NEAR s, it is clearly in
+        # its band, which need not be computed.
+        is_near_1 = (test.ratio - 1.0) ** 2 * test.mean**2 < NEAR**2 * test.variance
+        if test.numbers < FEWEST or is_near_1:
             continue
         low, high = test.band()
         if test.explain_doubt() is not None:

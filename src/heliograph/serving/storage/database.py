@@ -10,6 +10,7 @@ from sqlalchemy.exc import ArgumentError, DBAPIError, InterfaceError, Operationa
 from heliograph.numerics.check import fail, text
 
 PAGES = "page_size=4096", "cache_size=-16384"  # bytes, of a new database: a small commit writes four; kB in memory
+# Words in a server's refusal whose reason passes.
 PASSING = "starting up", "shutting down", "terminating connection", "recovery mode", "too many clients"
 PLACE = "a file, or a URL as postgresql://host/database"
 
@@ -54,7 +55,7 @@ def is_server_away(error: SQLAlchemyError) -> bool:
     """
     if not isinstance(error, DBAPIError) or isinstance(error.orig, sqlite3.Error):
         return False
-    said = str(error.orig)
+    said = str(error.orig)  # in the server's words, where FATAL means that it ended the connection
     refused = "FATAL" in said and not any(words in said for words in PASSING)
     lost = error.connection_invalidated or isinstance(error, OperationalError | InterfaceError)
     return lost and not refused

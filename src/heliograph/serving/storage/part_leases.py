@@ -59,6 +59,7 @@ class Leases:
         with self._raise_if_away(), self.engine.begin() as connection:
             now = float(connection.execute(NOW[self.engine.dialect.name]).scalar_one())
             fair_share = self._report_and_count_fair_share(connection, now)
+            # Leases that are not over, of all processes.
             select_leased = select(PARTS.c.number, PARTS.c.process).where(PARTS.c.until >= now)
             process_of_part = {row.number: row.process for row in connection.execute(select_leased)}
             own = [number for number in sorted(process_of_part) if process_of_part[number] == self.process]

@@ -35,8 +35,9 @@ from heliograph.serving.storage.store_tables import (
     select_plants,
 )
 
+# Names of stored counts: the newest output published (by process), the newest output, and unreadable messages.
 PUBLISHED, NEWEST, MALFORMED = "published to the reader of {}", "journal", "malformed"
-WORD, TOPIC = "last word on ", 200  # longest topic of which a word is kept
+WORD, TOPIC = "last word on ", 200  # before a topic: the last status of its device; characters of the longest one
 IDENTITY = "identity"
 MEND = "its plants go on in a new store with --store NEW --from-snapshot"
 
@@ -73,11 +74,7 @@ class Store:
         carrier: PlantMigration | None = None,
         begun: bool = False,
     ):
-        """Open the database at `location`, or make it, and check that it is of the network `mine`.
-
-        `mine` says of which network a state must be; None opens any. `opened` is a store on the same location that has
-        looked for damage, `carrier` converts plants of another network, and `begun` demands that there is a state.
-        """
+        """Open the database, or make it, and check that it is of the network `mine`. The arguments are the class's."""
         self.process, self.journal, self._begun = process, journal, begun
         self.identity: Identity = {}
         mine = None if mine is None else table("identity of a store", mine, "texts") | {LAYOUT_KEY: LAYOUT}
@@ -100,10 +97,7 @@ class Store:
     def _open_state(self, mine: Identity | None, opened: "Store | None", carrier: PlantMigration | None) -> None:
         """Read the identity, raise ValueError if the state cannot be used, find damaged plants, and carry plants over.
 
-        Args:
-            mine: identity of the network, with the layout of this version; None opens any.
-            opened: a store open on the same location, which has already looked for damage.
-            carrier: converts the plants of another network; None refuses them.
+        The arguments are the class's; `mine` also has the layout of this version.
         """
         self.identity = self._read_identity(mine)
         self._check_layout(carrier is not None or mine is None)
@@ -132,7 +126,10 @@ class Store:
 
     @contextmanager
     def _name_store_in_errors(self, expected: str) -> Iterator[None]:
-        """Turn errors of the database into one line that names the store and says what was `expected` of it."""
+        """Within the `with` block, turn errors of the database into one line that names the store.
+
+        It says what was `expected`. AwayError means that a server does not answer now, so that one may try again.
+        """
         try:
             yield
         except UnicodeError:  # the database's message quotes a damaged name
@@ -216,7 +213,7 @@ class Store:
                 results[name] = StoredPlant(version, body)
             else:
                 results[name] = StoredPlant(0, b"", damage=self._describe_damage(name, "a damaged one"))
-        # A new name may be that of a plant whose name is damaged.
+        # A name that is not stored may be that of a plant whose name is damaged.
         nameless = [name for name, damage in self.damaged.items() if not damage.named]
         for name in names if nameless else ():
             got = f"none of that name, and damaged ones that may have had it: {', '.join(map(repr, nameless))}"
@@ -284,7 +281,10 @@ class Store:
         return outputs
 
     def unpublished(self) -> list[Output]:
-        """Return the outputs that were committed after the last one known as published; some may not be published."""
+        """Return the outputs that this process committed after the last one that it recorded as published.
+
+        Some of them may be published all the same, since this is recorded with the next commit only.
+        """
         published = self.number(PUBLISHED.format(self.process))
         entries = self.entries(published, self.process)
         return [entry for entry in entries if entry.number is not None and entry.number > published]

@@ -19,6 +19,7 @@ try:
 except ImportError:  # on Windows
     fcntl = None  # type: ignore[assignment]
 
+# Asks PostgreSQL which session has an advisory lock, and from which machine.
 WHOSE = text("""
     SELECT application_name, coalesce(client_addr::text, 'its own machine') FROM pg_stat_activity
     WHERE pid = (SELECT pid FROM pg_locks WHERE locktype = 'advisory' AND objid::bigint = :key AND classid = :space
@@ -67,7 +68,10 @@ def own_store(location: str, process: str) -> Iterator[None]:
 
 @contextmanager
 def _lock_file(path: str, process: str) -> Iterator[None]:
-    """Hold a lock on a file beside an SQLite store, which names the process that has it."""
+    """Hold a lock on a file beside an SQLite store within the `with` block; raise if another process has it.
+
+    The file has the name of the process that holds the lock, for the error that others get.
+    """
     safe_name = "".join(c if c.isalnum() else "-" for c in process)  # a process's name may be no name of a file
     lock = f"{path}{'.' if process else ''}{safe_name}.lock"
     try:

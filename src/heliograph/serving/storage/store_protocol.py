@@ -41,9 +41,11 @@ class Entry(NamedTuple):
 
     @staticmethod
     def numbered(entries: Iterable["Entry"], begin: int) -> list[Output]:
-        """Return the outputs with their numbers, counted from `begin`."""
-        counted = enumerate(entries, begin)
-        return [Output._make((i, plant, kind, b'{"id":%d,' % i + body[1:], "")) for i, (plant, kind, body) in counted]
+        """Return the outputs with their numbers, counted from `begin`, which become the first member of their JSON."""
+        return [
+            Output(number, plant, kind, b'{"id":%d,' % number + body[1:])  # body[0] is the opening brace
+            for number, (plant, kind, body) in enumerate(entries, begin)
+        ]
 
 
 class ConflictError(Exception):
@@ -143,7 +145,7 @@ class InMemoryStore:
         return []
 
     def words(self) -> dict[str, int]:
-        """Return no words: none are kept."""
+        """Return no statuses of devices: none are kept."""
         return {}
 
     def keep_words(self, words: Mapping[str, int]) -> None:
@@ -156,7 +158,7 @@ class InMemoryStore:
 def describe_damaged_plants(plants: Mapping[str, DamagedRow]) -> str:
     """Return a sentence for users on damaged plants, with the options that begin the first LISTED of them anew.
 
-    It also says whether a plant has lost its name (`named` is False).
+    A plant whose name is damaged has lost it: any new plant may be that one, so that none can begin.
     """
     options = " ".join(f"--anew {quote(name)}" for name in list(plants)[:LISTED])
     more = "" if len(plants) <= LISTED else f" and {len(plants) - LISTED} more"

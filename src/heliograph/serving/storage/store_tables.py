@@ -9,6 +9,7 @@ from sqlalchemy import BigInteger, Column, Connection, LargeBinary, MetaData, St
 # Of these tables: those of layout 1 had no checksums, of 2 no description of the network, of 3 covariances in states,
 # of 4 the parts of a state's Gaussian beside its others.
 LAYOUT, CARRIED = "5", ("3", "4", "5")  # that of now, and those whose plants can be carried over
+# Key of the layout in a store's identity.
 LAYOUT_KEY = "layout of the store"
 AT_ONCE = 500  # rows that are asked for at once
 TABLES = MetaData()
@@ -22,7 +23,10 @@ IDENTITY_TABLE = Table("whose", TABLES, Column("name", String(20), primary_key=T
 
 
 def checksum(name: str | int, *values: str | int | bytes) -> int:
-    """Return the CRC-32 of a row's name in the upper 31 of 63 bits, and of the name and all columns in the lower 32."""
+    """Return the CRC-32 of a row's name in the upper 31 of 63 bits, and of the name and all columns in the lower 32.
+
+    So it can be told whether the name of a damaged row is still right.
+    """
     return (crc32(f"{name}".encode()) >> 1) << 32 | _checksum_row(name, values)
 
 
@@ -48,13 +52,16 @@ def _checksum_row(name: str | int, values: Sequence[str | int | bytes]) -> int:
 
 
 def add_checksum(table: Table, *values: Any) -> dict[str, object]:
-    """Return a row of a table, with its checksum, by column."""
+    """Return {column: value} of a row with these values in the table's order, and with its checksum as the last."""
     columns = [column.name for column in table.c]
     return dict(zip(columns, (*values, checksum(*values)), strict=True))
 
 
 def select_plants(connection: Connection, columns: Sequence[Column[object]], names: list[str]) -> list[Any]:
-    """Return rows with these columns of the stored plants of these names; a query asks for AT_ONCE names at most."""
+    """Return the stored plants of these names as rows with these columns; names that are not stored have no row.
+
+    The names are asked for in queries of AT_ONCE (500) names, since databases bound the length of a query.
+    """
     results: list[Any] = []
     for i in range(0, len(names), AT_ONCE):
         results += connection.execute(select(*columns).where(PLANTS.c.name.in_(names[i : i + AT_ONCE]))).all()
