@@ -80,9 +80,10 @@ class _DenseInverseHessian:
 
         H: the inverse Hessian, `self.matrix`. H+ = (I - s y'/s'y) H (I - y s'/s'y) + s s'/s'y.
         """
-        curvature, is_first = float(s @ y), self.is_first_update
+        curvature = float(s @ y)
+        is_first = self.is_first_update
         self.is_first_update = False
-        if curvature <= CURVED * np.linalg.norm(s) * np.linalg.norm(y):
+        if curvature <= CURVED * np.linalg.norm(s) * np.linalg.norm(y):  # not positive beyond rounding
             return
         if is_first:  # the first H was a guess; the step has shown the curvature, so H begins as I s'y / y'y
             self.matrix = np.eye(len(s)) * curvature / float(y @ y)
@@ -116,7 +117,10 @@ class _LimitedInverseHessian:
         return v
 
     def update(self, s: np.ndarray, y: np.ndarray) -> None:
-        """Remember an update whose curvature s'y is positive."""
+        """Remember a step s and its change y of the gradient, if the curvature s'y is positive beyond rounding.
+
+        The oldest update is dropped where `memory` of them are kept already.
+        """
         if s @ y > CURVED_OF_MANY * np.linalg.norm(s) * np.linalg.norm(y):
             self.updates.append((s, y))
 

@@ -71,7 +71,7 @@ _propagate = compile_in_float64(propagate_error_moments)
 
 
 def initial_error_covariance(network: RelayNetwork) -> Float[np.ndarray, "d d"]:
-    """Return the covariance of (x_0, e_1 .. e_F)."""
+    """Return the covariance of (x_0, e_1 .. e_F), where each of the F filters starts at E x_0: e_f = x_0 - E x_0."""
     return initial_error_moments(network.initial()[1], len(network.filters))
 
 
@@ -84,10 +84,11 @@ def join_gains(network: RelayNetwork, gains: GainsByFilter) -> Float[np.ndarray,
         raise fail("gains", f"those of {list(network.filters)}", list(gains))
     n, first = len(network.states), network.filters[0]
     length = len(array(f"gains of {first!r}", gains[first], (None, None, None)))
-    joined, start = np.zeros((length, len(network.filters) * n, sum(network.received))), 0
+    joined = np.zeros((length, len(network.filters) * n, sum(network.received)))
+    start = 0  # column of the filter's first received number
     for f, (name, size) in enumerate(zip(network.filters, network.received, strict=True)):
-        value = array(f"gains of {name!r}", gains[name], (length, n, size))
-        joined[:, f * n : (f + 1) * n, start : start + size] = value
+        rows, columns = slice(f * n, (f + 1) * n), slice(start, start + size)
+        joined[:, rows, columns] = array(f"gains of {name!r}", gains[name], (length, n, size))
         start += size
     return joined
 
@@ -139,13 +140,16 @@ def relay_schedules(network: RelayNetwork, design: RelayDesign) -> dict[str, Sch
         raise fail("design", f"filters {list(network.filters)}", list(design.gains))
     _check_start(network, design)
     steps = network.steps(len(design.moments) - 1)
-    # Predicted moments of (x, e_1 ... e_F, innovations); d is the size of (x, e_1 ... e_F), errors before correction.
-    predicted, d = np.asarray(_predict_covariances(steps, design.moments[:-1])), design.moments.shape[-1]
+    # Covariances of (x, e_1 .. e_F, innovations) at each step, with the errors before their correction. The first d
+    # entries are (x, e_1 .. e_F), and the innovations stand filter after filter.
+    predicted = np.asarray(_predict_covariances(steps, design.moments[:-1]))
+    d = design.moments.shape[-1]
     n, ends = len(network.states), np.cumsum(network.received)
     start_mean, _start_covariance = network.initial()
     schedules = {}
     for f, (name, size) in enumerate(zip(network.filters, network.received, strict=True)):
-        received, error = slice(ends[f] - size, ends[f]), slice((1 + f) * n, (2 + f) * n)
+        received = slice(ends[f] - size, ends[f])  # the filter's own, of all received numbers
+        error = slice((1 + f) * n, (2 + f) * n)  # its error e_f, after x and the filters before it
         gains = _make_gains(
             steps,
             design.gains[name],
@@ -201,7 +205,8 @@ def _make_gains(
 def _check_start(network: RelayNetwork, design: RelayDesign) -> None:
     """Raise ValueError if the design's moments at k = 0 are not those of the network's start.
 
-    A periodic design fails this check. It has one step for each slot, and ends with the moments with which it begins.
+    A filter that runs from the start cannot use the gains of another start. A periodic design fails this check: it has
+    one step for each slot, and ends with the moments with which it begins; the message then says so.
     """
     # The start is compared to rounding. A periodic design was found by iteration, so its ends agree less closely.
     expected, start = initial_error_covariance(network), design.moments[0]

@@ -31,9 +31,11 @@ PRECISION = 1e-8  # of the cost at the start: five iterations in a row that gain
 
 
 class PowerLimit(NamedTuple):
-    """Each step's gains must keep <form_k, moments after the step> below limit_k: the power of the next step.
+    """Each step's gains must keep <form_k, moments after step k> below limit_k, <A, B> the sum of A_ij B_ij.
 
-    Both without the power of the mean state, which every unbiased estimate sends; a step before silence has form 0.
+    The moments are Cov(x, e_1 .. e_F), of the state and the filters' errors; what relays send at step k + 1 are
+    estimates of step k. Form and limit leave out the power of the mean state, which every unbiased estimate sends. The
+    form is 0 where no relay sends at the next step.
     """
 
     form: Float[Array, "*time d d"]
@@ -41,7 +43,10 @@ class PowerLimit(NamedTuple):
 
 
 class PowerLimitedProblem(NamedTuple):
-    """Minimise sum_k <cost_k, moments after step k> within a power limit, from the moments `start`."""
+    """Minimise sum_k <cost_k, moments after step k> within a power limit, from the moments `start` before the first.
+
+    The moments are Cov(x, e_1 .. e_F) (d, d), of the state and the errors of all filters; <A, B> = sum of A_ij B_ij.
+    """
 
     steps: RelaySteps
     start: Float[Array, "d d"]
@@ -129,7 +134,11 @@ def minimise_within_limit(
 def _scale_into_limit(
     problem: PowerLimitedProblem, local_gains: Float[np.ndarray, "time Fn R"]
 ) -> Float[np.ndarray, "time Fn R"]:
-    """Scale the relays' gains by one factor so that ROOM of the limit is left; without gains all of it is."""
+    """Return the gains with the relays' scaled by one factor, at most 1, so that the share ROOM of each limit is free.
+
+    Without gains relays send the mean state alone, and all of the limit is free: so a factor exists, found by bisection
+    in HALVINGS steps. A descent with a logarithmic barrier needs such a start inside the limits.
+    """
     relay_rows = local_gains.shape[1] - problem.steps.transition.shape[-1]  # without the receiver's, the last
 
     def scale_relays(factor: float) -> np.ndarray:
@@ -139,9 +148,10 @@ def _scale_into_limit(
     low, high = 0.0, 2.0  # the first middle is 1, the gains as they are
     for _ in range(HALVINGS):
         middle = (low + high) / 2
-        if np.min(_compute_cost_and_slack(problem, scale_relays(middle))[1]) < ROOM:
+        _cost, free_shares = _compute_cost_and_slack(problem, scale_relays(middle))
+        if np.min(free_shares) < ROOM:
             high = middle
-        elif middle == 1.0:
+        elif middle == 1.0:  # the gains as they are leave room
             return local_gains
         else:
             low = middle
@@ -181,7 +191,11 @@ def _compute_cost_with_barrier(
     barrier: float,
     x: Array,
 ) -> tuple[Float[Array, ""], Float[Array, "time r"]]:
-    """Return the cost and barrier at gains moved by x, infinite outside the limit, and its gradient."""
+    """Return the cost and barrier at gains moved by x, infinite outside the limit, and its gradient by x (time, r).
+
+    The gains are those of `_change_gains`: x changes the r free entries of each step in `units`. `barrier` is the
+    weight t of -log(free share of a power limit), summed over the steps.
+    """
 
     def value(x: jax.Array) -> jax.Array:
         """Return cost - barrier sum log(slack) at gains moved by x, `slack` the free share of each power limit.
