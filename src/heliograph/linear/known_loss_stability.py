@@ -31,9 +31,17 @@ ModeCovariances = Float[np.ndarray, "modes n n"]
 class KnownLossSystem(NamedTuple):
     """Linear plant x+ = A x + w, Cov(w) = Q, behind links with modes i; the receiver knows their kind s = known[i].
 
-    It receives C_s x + v, Cov(v) = R_i. `chain[i, j]` = P(next mode j | now i), `law` is the modes' law in the long
-    run.
-    The receiver cannot distinguish modes of one kind, so a gain belongs to a kind. A kind without rows is a loss.
+    It receives C_s x + v, Cov(v) = R_i. The receiver cannot distinguish modes of one kind, so a gain belongs to a kind.
+    A kind whose C_s has no rows is a loss.
+
+    Args:
+        transition: A (n, n).
+        process: Q (n, n).
+        chain: `chain[i, j]` = P(next mode j | now i).
+        law: probability of each mode in the long run.
+        known: the kind of each mode.
+        outputs: C_s of each kind.
+        noises: R_i of each mode, of the size of its kind's output.
     """
 
     transition: Float[np.ndarray, "n n"]
@@ -67,7 +75,7 @@ class KnownLossSystem(NamedTuple):
 
         The spectral radius of the closed loop must be below 1, else there is no steady covariance.
         """
-        (V,) = self.close_loop(gains).steady()
+        (V,) = self.close_loop(gains).steady()  # of the only step of the period
         U: ModeCovariances = mix_moments_of_modes(self.chain, V)
         return U
 

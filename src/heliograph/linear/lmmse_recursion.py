@@ -113,26 +113,29 @@ def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
     Source: Kalman (1960), with the second moments of random coefficients in the noises.
     """
     instance("system", system, LinearSystem, "a LinearSystem")
-    root, gains_by_step = roots_of(system.covariance), list[Gains]()
+    root = roots_of(system.covariance)  # of P, the error covariance: P = root root'
+    gains_by_step = list[Gains]()
     # E[y_i^2] at the start, by whose size the noises' rounding is judged.
     second_moments = system.mean**2 + np.diag(system.covariance)
     noises = find_noise_roots(system.step(0), second_moments)
     rounding = CarriedRounding(covariance=np.diag(system.start_rounding), worst=0.0, when=0)
-    steady_from, before = system.steady_from, None  # before: the covariance, as it was SPAN steps ago
+    steady_from = system.steady_from  # from this step on all steps of the system are equal
+    earlier: Pair | None = None  # P and its rounding SPAN steps ago
     for k in range(system.horizon):
-        # From `steady_from` on all steps of the system are the same. There, every SPAN steps, test whether the error
-        # covariance has converged: then all later gains are the last ones, to rounding.
+        # Where the system is steady, test every SPAN steps whether the error covariance has converged: then all later
+        # gains are the last ones, to rounding.
         if k > steady_from and (k - steady_from) % SPAN == 0:
             now = covariance_of_root(root), rounding.covariance
-            if before is not None and _has_converged(now, before, gains_by_step[-1].transition):
+            if earlier is not None and _has_converged(now, earlier, gains_by_step[-1].transition):
                 break
-            before = now
+            earlier = now
         matrices = system.step(k)
         if 0 < k <= steady_from:  # later steps have the noises of step `steady_from`
             noises = find_noise_roots(matrices, second_moments)
         # P- = A P A' + Q, S = C P- C' + R, K = P- C' S^-1, P = P- - K S K', by roots; then the rounding that P carries.
         covariances = step_covariance_roots(root, matrices, noises)
-        gains, root = _make_gains(system, matrices, covariances), covariances.root
+        gains = _make_gains(system, matrices, covariances)
+        root = covariances.root
         rounding = rounding.after_step(system, k, matrices, gains)
         gains_by_step.append(gains)
     over_time = Gains(*(repeat_last_step(values, system.horizon) for values in zip(*gains_by_step, strict=True)))
@@ -187,21 +190,21 @@ def _has_converged(after: Pair, before: Pair, loop: Float[np.ndarray, "N N"]) ->
     return True
 
 
-def _lower_unsupported_claim(claim: Claim, lost: float, step: int) -> Claim:
+def _lower_unsupported_claim(claim: Claim, share_of_rounding: float, step: int) -> Claim:
     """Return the claim of a covariance, or warn and lower it to "nominal" if rounding is too large.
 
-    `lost` is the largest share that rounding has of a claimed variance, and `step` is the step where it occurs. A share
-    up to DIGITS_TOLERANCE is accepted.
+    `share_of_rounding` is the largest share that rounding has of a claimed variance, and `step` is the step where it
+    occurs. A share up to DIGITS_TOLERANCE is accepted.
     """
+    if share_of_rounding <= DIGITS_TOLERANCE:
+        return claim
     remedy = "use a shorter horizon, a lower degree, units in which the state is near zero, or linear_filter"
-    if lost > DIGITS_TOLERANCE:
-        warnings.warn(
-            f"lmmse: rounding is {lost:.1g} of a claimed variance at step {step}: the state's own moments have "
-            f"outgrown the error's, so the claim is nominal; {remedy}",
-            stacklevel=3,
-        )
-        return weakest([claim, "nominal"])
-    return claim
+    warnings.warn(
+        f"lmmse: rounding is {share_of_rounding:.1g} of a claimed variance at step {step}: the state's own moments "
+        f"have outgrown the error's, so the claim is nominal; {remedy}",
+        stacklevel=3,
+    )
+    return weakest([claim, "nominal"])
 
 
 def true_covariance(system: LinearSystem, schedule: Schedule) -> Float[np.ndarray, "time q q"]:
@@ -224,14 +227,17 @@ def true_covariance(system: LinearSystem, schedule: Schedule) -> Float[np.ndarra
         got = f"{schedule.horizon} steps of {received_by_schedule} measurements"
         raise fail("schedule", f"{system.horizon} steps of {m} measurements", got)
     # Mean and covariance of (y, s); at the start s is a known number.
-    mean, covariance = np.append(system.mean, schedule.start), np.pad(system.covariance, (0, len(schedule.start)))
+    mean = np.append(system.mean, schedule.start)
+    covariance = np.pad(system.covariance, (0, len(schedule.start)))
     q = len(system.projection)
     covariances = []
     for k in range(system.horizon):
         gains = Gains(*(field[k] for field in schedule.gains))
         mean, covariance = _propagate_errors(system.step(k), gains, system.projection, mean, covariance)
-        # The last q numbers are x - xhat; the others, (y, s), go into the next step.
-        covariances.append(covariance[-q:, -q:] + np.outer(mean[-q:], mean[-q:]))
+        # The last q numbers are the error x - xhat, whose second moment is Cov + mean mean'; the others, (y, s), go
+        # into the next step.
+        error_mean, error_covariance = mean[-q:], covariance[-q:, -q:]
+        covariances.append(error_covariance + np.outer(error_mean, error_mean))
         mean, covariance = mean[:-q], covariance[:-q, :-q]
     return np.array(covariances)
 

@@ -55,10 +55,12 @@ class SteadyMomentTest:
         decay = 1 - spectral_radius(matrix)
         self._tolerance = -1.0 if varies or decay <= 0 else EPS * decay
         # Moments are E of all products of `order` factors of (x, 1). E[x_i^2] has x_i twice, and the 1 order - 2 times.
-        n, index_of_moment = len(matrix), position(len(matrix) + 1, order)
+        n = len(matrix)
+        index_of_moment = position(n + 1, order)
         self._powers = np.array(list_exponents(n + 1, order))[:, :n]  # exponents of x in each moment
-        self._squares = [index_of_moment[(*(2 * int(i == j) for j in range(n)), order - 2)] for i in range(n)]
-        self._last: Moments | None = None
+        exponents_of_squares = [(*(2 * int(i == j) for j in range(n)), order - 2) for i in range(n)]
+        self._squares = [index_of_moment[exponents] for exponents in exponents_of_squares]  # where E[x_i^2] stand
+        self._last: Moments | None = None  # the moments of the call before
 
     def is_steady(self, moments: Moments) -> bool:
         """Return whether the moments equal those of the previous call up to rounding; False at the first call."""
@@ -102,7 +104,8 @@ def lift_modes(
     distinct = {id(measurement): measurement for measurement in measurements}
     varies = len(distinct) > 1
     lifts_by_id = {i: [LiftedMap(m, degree, varies) for m in measurement.maps] for i, measurement in distinct.items()}
-    matrix_by_id = {i: np.asarray(p.moments(degree).matrix) for i, p in {id(p): p for p in plants}.items()}
+    distinct_plants = {id(plant): plant for plant in plants}
+    matrix_by_id = {i: np.asarray(plant.moments(degree).matrix) for i, plant in distinct_plants.items()}  # M
     # If nothing varies and moments and law are steady, all later steps equal the last one, to rounding. Step 0, in
     # which the chain does not move, is no such step.
     steady = SteadyMomentTest(np.asarray(plants[0].matrix), 2 * degree, varies or len(matrix_by_id) > 1)
@@ -115,9 +118,10 @@ def lift_modes(
             moments = np.asarray(push_moments(plant, 2 * degree, moments))
         check_finite_moments(moments, k, 2 * degree)
         next_second = products_of_monomials(moments, n + 1, degree)
-        matrix, lifts = matrix_by_id[id(plant)], lifts_by_id[id(measurement)]
+        matrix, lifts = matrix_by_id[id(plant)], lifts_by_id[id(measurement)]  # M, and the maps y -> z by mode
         process, law = _compute_noise_and_next_law(law, chain, matrix @ second @ matrix.T, next_second)
         noise, rounding_of_noise = _average_noise(law, lifts, moments)
+        # K_1, K_2, ... side by side, without their last row, that of the constant 1 among the monomials of z.
         output = np.concatenate([lift.matrix for lift in lifts], axis=1)[:-1]
         no_drift, no_offset = np.zeros(len(mean)), np.zeros(len(output))
         steps.append(Steps(np.kron(chain.T, matrix), no_drift, process, output, no_offset, noise))
@@ -156,14 +160,17 @@ def _average_noise(
 
     `law` holds the modes' probabilities p_j, `lifts` each mode's map to monomials Z of z, `moments` those of y.
     """
-    covariances, losses = zip(*(lift.mean_conditional_covariance(moments) for lift in lifts), strict=True)
-    return np.tensordot(law, covariances, axes=1), np.abs(law) @ np.array(losses)
+    covariances, roundings = zip(*(lift.mean_conditional_covariance(moments) for lift in lifts), strict=True)
+    return np.tensordot(law, covariances, axes=1), np.abs(law) @ np.array(roundings)
 
 
 def _keep_if_unchanged(
     law: Float[np.ndarray, " modes"], after: Float[np.ndarray, " modes"]
 ) -> Float[np.ndarray, " modes"]:
-    """Return the law after a step, or the same law as before if both agree to rounding: so a steady one is found."""
+    """Return the law `after` a step, or the law before it if both agree to rounding (4 EPS, relative).
+
+    So a steady law stays the same numbers, and a test for equality finds it.
+    """
     return law if np.allclose(law, after, rtol=4 * EPS, atol=0) else after
 
 
@@ -204,7 +211,8 @@ def lifted_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: 
     # Start of the lifted state: E Y_0 and Cov Y_0.
     second = products_of_monomials(moments, n + 1, degree)
     mean, covariance = mean_and_covariance(second)
-    varies = isinstance(plant, OverTime), isinstance(sensor, OverTime) or isinstance(channel, OverTime)
+    measurement_varies = isinstance(sensor, OverTime) or isinstance(channel, OverTime)
+    varies = isinstance(plant, OverTime), measurement_varies
     steps, process_rounding, received_rounding = _lift_steps(routes, degree, moments, varies)
     system = LinearSystem(
         steps,
