@@ -43,7 +43,10 @@ class HInfinityCertificate(NamedTuple):
 
     @property
     def text(self) -> str:
-        """One line that says whether the level is certified, and why not, or which growth constants are assumed."""
+        """One line that says whether the level gamma, the error's norm over the disturbances', is certified.
+
+        If not, it says why not; if so, which growth constants it rests on are not proved but assumed.
+        """
         if not self.certified:
             return f"level {self.level:g} is not certified: {'; '.join(self.reasons)}"
         all_proved = "growth constants proved in their boxes, or zero"
@@ -233,7 +236,8 @@ def make_theorem_matrix(
             matrix[:, at[name] : at[name] + block.shape[1]] = block
         return matrix
 
-    # V eta, E[G] (C xhat + h(xhat)) and R eta.
+    # The matrices V = [C x + h + D v; rho], E[G] (C xhat + h(xhat)) with xhat = x - e and h(xhat) = h - h~, and
+    # R = [A x + f + B v; A e + f~ + B v + K E[G] (C xhat + h(xhat))], each over eta.
     v_eta = np.concatenate([rows(y, x=C, h=eye(y), v=D), rows(r, r=eye(r))])
     expected = link.mean[:, :y] @ rows(y, x=C, e=-C, h=eye(y), d=-eye(y))
     r_eta = np.concatenate([rows(n, x=A, f=eye(n), v=B), rows(n, e=A, g=eye(n), v=B) + gain @ expected])

@@ -79,7 +79,8 @@ def _run_riccati(system: GrowthSystem, level: float, multipliers: Float[np.ndarr
     design.weights[0] = np.diag(np.repeat([state_weight, error_weight], n))
     # Step by step: K and P2 in closed form, p small enough that it does no harm.
     for k, step in enumerate(list_step_matrices(system, separate=True)):
-        found = _compute_best_gain(system, step, design.weights[k, n:, n:], inner_level, multipliers[k])
+        error_weight_before = design.weights[k, n:, n:]  # P2 of step k
+        found = _compute_best_gain(system, step, error_weight_before, inner_level, multipliers[k])
         if found is None:
             text = f"no gain exists at step {k} of {steps} with these multipliers"
             return design._replace(status=text, failed_step=k)

@@ -188,7 +188,7 @@ def _list_changes(
 
     if isinstance(model, OverTime):
         return compute
-    same = compute(0)
+    same = compute(0)  # of a model that does not vary
     return lambda k: same
 
 
@@ -199,6 +199,13 @@ def _compare(
 
     A value at 0 is refused too: behind a random gain it makes an error without any disturbance. ROUNDING: the
     difference, relative to the change, that counts as rounding.
+
+    Args:
+        name: what is compared, in the error message.
+        expected: what it should be, in the error message.
+        found: f(0), and f(x) - f(0) at the unit vectors x, as columns.
+        matrix: A of the system, whose columns are A x at the unit vectors.
+        growth: a of |f(x) - f(y) - A (x - y)| <= a |x - y|.
     """
     at_zero, changes = found[:, 0], found[:, 1:]  # as of `_list_changes`
     if np.linalg.norm(at_zero) > ROUNDING * max(1.0, float(np.linalg.norm(matrix))):

@@ -78,7 +78,7 @@ def bound_program(jaxpr: core.ClosedJaxpr, arguments: Sequence[Interval], contin
 
 
 def point_interval(value: object) -> Interval:
-    """Return the interval that holds a single value."""
+    """Return the interval that holds a known value, or an array of values, alone: both ends are the value."""
     array = np.asarray(value)
     return Interval(array, array)
 
@@ -162,7 +162,7 @@ def _apply_to_ends(equation: Any, x: list[Interval]) -> list[Interval]:
 
 
 def _apply_to_numbers(equation: Any, ends: list[Numbers]) -> list[Numbers]:
-    """Return the operation's results on numbers."""
+    """Return an operation's results on arrays of numbers, as JAX computes them; `ends` are its arguments."""
     outputs = equation.primitive.bind(*map(jax.device_put, ends), **equation.params)
     return list(map(np.asarray, outputs if equation.primitive.multiple_results else [outputs]))
 

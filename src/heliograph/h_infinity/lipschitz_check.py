@@ -180,7 +180,10 @@ def _check_box(low: ArrayLike, high: ArrayLike) -> tuple[Float[np.ndarray, "n"],
 
 
 class _LipschitzMeter:
-    """Slopes and ratios of a function at points (count, n) or pairs (count, 2n), compiled once; width: of the box."""
+    """Slopes |Jacobian| of a function at points (count, n), and ratios |f(x) - f(y)| / |x - y| of pairs (count, 2n).
+
+    A pair is x and y behind each other. Function and Jacobian are compiled once. `width` is that of the box.
+    """
 
     def __init__(self, function: Function, width: float):
         """Compile the function and its Jacobian; `width` is that of the region, by which distances are judged."""
@@ -197,7 +200,9 @@ class _LipschitzMeter:
 
     def find_steepest_directions(self, points: Float[np.ndarray, "count n"]) -> Float[np.ndarray, "count n"]:
         """Return the unit direction in which the function changes most at each point."""
-        return np.linalg.svd(np.nan_to_num(self.jacobian(points), posinf=0.0, neginf=0.0))[2][:, 0]
+        jacobians = np.nan_to_num(self.jacobian(points), posinf=0.0, neginf=0.0)
+        _left, _singular_values, right = np.linalg.svd(jacobians)
+        return right[:, 0]  # the right singular vector of the largest singular value
 
     def measure_ratios(self, pairs: Float[np.ndarray, "count both"]) -> Float[np.ndarray, "count"]:
         """Return the ratio |f(x) - f(y)| / |x - y| of each pair, 0 if x and y are so close that it is rounding."""
@@ -305,15 +310,27 @@ def _climb_at_random(
     high: Float[np.ndarray, "n"],
     random: np.random.Generator,
 ) -> Float[np.ndarray, "climbers n"]:
-    """Return the CLIMBERS best starts, each moved to the best of random moves around it ROUNDS times, in the box."""
+    """Return points of the box where an objective is large: a random search that climbs from the best `starts`.
+
+    The CLIMBERS best starts are kept. In each of ROUNDS rounds each moves to the best of TRIALS points, itself and
+    random ones around it, whose distance shrinks by SHRINK from round to round.
+
+    Args:
+        objective: from points (count, n) to the numbers (count,) that are to be large.
+        starts: points to begin with.
+        low: lower corner of the box.
+        high: upper corner.
+        random: generator of the moves.
+    """
     climbers = starts[np.argsort(-objective(starts), kind="stable")[:CLIMBERS]]
     deviation = (high - low) / 2
     for _ in range(ROUNDS):
-        # TRIALS normal moves of each, the first of which stays, then smaller ones.
+        # TRIALS normal moves of each, the first of which stays.
         trials = climbers[:, None] + deviation * random.normal(size=(len(climbers), TRIALS, len(low)))
         trials[:, 0] = climbers
         trials = np.clip(trials, low, high)
         values = objective(trials.reshape(-1, len(low))).reshape(len(climbers), TRIALS)
-        climbers = trials[np.arange(len(climbers)), values.argmax(axis=1)]
+        best = values.argmax(axis=1)  # of each climber's trials
+        climbers = trials[np.arange(len(climbers)), best]
         deviation = SHRINK * deviation
     return climbers

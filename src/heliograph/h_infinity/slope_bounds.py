@@ -34,7 +34,8 @@ def prove_slope_bound(
     try:
         with jax.enable_x64(True):
             example = jnp.zeros((BOXES, len(low)))
-            # The function itself over the whole box: refused unless it is continuous.
+            # The function itself over the whole box: refused unless it is continuous. Programs take BOXES boxes at
+            # once, so the box is repeated.
             values = jax.vmap(lambda x: jnp.atleast_1d(function(x)))
             whole_box = Interval(np.tile(low, (BOXES, 1)), np.tile(high, (BOXES, 1)))
             bound_program(jax.make_jaxpr(values)(example), [whole_box], continuous=True)
@@ -47,7 +48,16 @@ def prove_slope_bound(
 def _sharpen_bound(
     slopes: jax.extend.core.ClosedJaxpr, low: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"], goal: float
 ) -> float:
-    """Return the largest bound of a slope, after halving boxes whose bound is above the goal, LIMIT boxes at most."""
+    """Return a bound of all slopes in a box, as sharp as the `goal` if that takes at most LIMIT boxes.
+
+    Boxes whose bound is above the goal are halved, since bounds by interval arithmetic are sharper over smaller boxes.
+
+    Args:
+        slopes: program of the Jacobian at BOXES points.
+        low: lower corner of the box (n,).
+        high: upper corner (n,).
+        goal: the slope that is not to be exceeded.
+    """
     bottoms, tops = low[None], high[None]
     largest_within = 0.0  # bound of the boxes that are within the goal
     boxes_seen = 0
