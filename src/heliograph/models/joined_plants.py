@@ -28,8 +28,8 @@ class TransitionSideBySide(Module):
     """Transition of several plants, each with its own part of the state and its own inputs.
 
     Args:
-        plants: the plants.
-        places: of each plant's inputs among all.
+        plants: the plants, whose states stand one after another in x.
+        places: for each plant, the indices of its own inputs among the inputs u of all.
     """
 
     plants: tuple[AbstractPlant, ...]
@@ -46,7 +46,7 @@ class TransitionSideBySide(Module):
 
 
 class MatrixSideBySide(TransitionSideBySide):
-    """The block-diagonal matrix of linear plants."""
+    """The block-diagonal matrix A of linear plants side by side, as a function of the inputs u of all."""
 
     def __call__(self, u: jax.Array) -> jax.Array:  # type: ignore[override]
         """Return A (n, n) of the joint state under the inputs u of all plants, with the plants' own on the diagonal."""
@@ -57,7 +57,7 @@ class MatrixSideBySide(TransitionSideBySide):
 
 
 class InputsSideBySide(TransitionSideBySide):
-    """The input matrices of linear plants, one above the other."""
+    """The input matrix B of linear plants side by side, one plant's rows above the next, as a function of u."""
 
     def __call__(self, u: jax.Array) -> jax.Array:  # type: ignore[override]
         """Return B (n, inputs) under the inputs u; a plant's rows are zero except in the columns of its own inputs."""
