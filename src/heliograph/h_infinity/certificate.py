@@ -86,18 +86,20 @@ def certify_level(
     """
     instance("system", system, GrowthSystem, "a GrowthSystem, as growth_system makes it")
     level = float(scalar("level", level, low=TINY, high=LARGEST))
-    findings = {"f": _list_findings("growth", growth), "h": _list_findings("output growth", output_growth)}
+    findings_of_f = _list_findings("growth", growth)
+    findings_of_h = _list_findings("output growth", output_growth)
     n, m, T = system.states, system.received, system.steps
     K = array("gains", gains, (T, n, m))
     if np.max(np.abs(K), initial=0.0) > LARGEST:
         raise fail("gains", f"entries of at most {LARGEST:g}", f"{np.max(np.abs(K)):g}")
     P = symmetric_weight("weights", array("weights", weights, (T + 1, 2 * n, 2 * n)))
-    lam = _complete_multipliers(array("multipliers", multipliers, (T, None)))
+    lam = _complete_multipliers(array("multipliers", multipliers, (T, None)))  # of f, f~, h, h~ at each step
     # Phi_k < 0 of every step.
     matrices = [make_theorem_matrix(system, k, K[k], P[k], P[k + 1], lam[k], level) for k in range(T)]
     largest = np.array([_largest_eigenvalue(phi) for phi in matrices])
     negative = np.array([is_negative_definite(phi) for phi in matrices])
-    # Initial condition level^2 W - P_0 > 0, and how far all these are from failing, free of units.
+    # Initial condition level^2 W - P_0 > 0, and how far all these are from failing: eigenvalues in units of the
+    # diagonal, so that the user's units do not matter.
     allowed = level**2 * system.initial_weight
     initial = float(np.linalg.eigvalsh(allowed - P[0])[0])
     initial_margin = smallest_eigenvalue(allowed - P[0], np.sqrt(np.diagonal(allowed)))
@@ -107,9 +109,10 @@ def certify_level(
     if not initial_margin > ROUNDING:
         reasons.append(f"initial condition: the smallest eigenvalue of level^2 W - P_0 is {initial:.3g}, not positive")
     reasons += _list_wrong_signs(P, lam)
-    reasons += _list_objections(system.growth, findings["f"]) + _list_objections(system.output_growth, findings["h"])
-    assumed = _list_assumed_constants("f", system.growth, findings["f"])
-    assumed += _list_assumed_constants("h", system.output_growth, findings["h"])
+    reasons += _list_objections(system.growth, findings_of_f)
+    reasons += _list_objections(system.output_growth, findings_of_h)
+    assumed = _list_assumed_constants("f", system.growth, findings_of_f)
+    assumed += _list_assumed_constants("h", system.output_growth, findings_of_h)
     return HInfinityCertificate(
         certified=not reasons,
         level=level,
@@ -117,14 +120,17 @@ def certify_level(
         steps_certified=T if negative.all() else int(np.argmin(negative)),
         initial=initial,
         margin=margin,
-        growth=tuple(findings["f"] + findings["h"]),
+        growth=tuple(findings_of_f + findings_of_h),
         reasons=tuple(reasons),
         assumed=tuple(assumed),
     )
 
 
 def _list_findings(name: str, given: Sequence[GrowthFinding]) -> list[GrowthFinding]:
-    """Check the growth findings that were given, and return them as a list."""
+    """Return the results of `check_growth` that a user gave, as a list; raise ValueError for anything else among them.
+
+    `name` is what they are called in errors.
+    """
     return [instance(name, finding, GrowthFinding, FINDINGS) for finding in items(name, given, FINDINGS)]
 
 

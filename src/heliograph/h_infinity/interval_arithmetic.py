@@ -168,7 +168,11 @@ def _apply_to_numbers(equation: Any, ends: list[Numbers]) -> list[Numbers]:
 
 
 def _compare(name: str, a: Interval, b: Interval) -> Interval:
-    """Return the interval of truth values of a comparison of a and b: (certainly true, possibly true)."""
+    """Return the interval of truth values of a comparison of x in a with y in b.
+
+    Its low end is True where the comparison holds for all such x and y, its high end where it holds for some. `name` is
+    that of JAX's operation: "lt", "le", "gt", "ge", "eq" or "ne".
+    """
     if name in ("gt", "ge"):
         return _compare({"gt": "lt", "ge": "le"}[name], b, a)
     if name == "ne":
@@ -210,7 +214,10 @@ def _bound_product(a: Interval, b: Interval) -> tuple[Numbers, Numbers]:
 
 
 def _bound_quotient(a: Interval, b: Interval) -> Interval:
-    """Return an interval that holds x / y for x in a and y in b: all numbers, if y may be 0."""
+    """Return an interval that holds x / y for x in a and y in b: all numbers, if y may be 0.
+
+    Else the quotient is monotone in x and in y, so that its extremes are at ends.
+    """
     holds_zero = (b.low <= 0) & (b.high >= 0)
     # Where y may be 0 the divisor is set to 1, and the quotient is not used.
     divisor = Interval(np.where(holds_zero, 1.0, b.low), np.where(holds_zero, 1.0, b.high))
@@ -252,11 +259,14 @@ def _bound_absolute(a: Interval) -> Interval:
 def _make_monotone_bound(
     function: Callable[[Numbers], Numbers], low: float = -np.inf, high: float = np.inf
 ) -> Callable[..., Interval]:
-    """Return the interval version of a nondecreasing function, whose values lie between `low` and `high`."""
+    """Return the interval version of a nondecreasing function, whose values lie between `low` and `high`.
+
+    The ends of an interval go to the ends of its values, widened by the error of the library's function (ULPS).
+    """
 
     def call(a: Interval) -> Interval:
         """Return the interval of the function's values on an interval of its argument."""
-        values = round_outward(function(a.low), function(a.high), ULPS)  # ULPS: error of a library's function
+        values = round_outward(function(a.low), function(a.high), ULPS)
         return Interval(np.maximum(values.low, low), np.minimum(values.high, high))
 
     return call

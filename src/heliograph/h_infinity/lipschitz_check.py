@@ -90,7 +90,10 @@ class GrowthFinding(NamedTuple):
 
     @property
     def text(self) -> str:
-        """One line that says whether the constant is proved, assumed or false in the box, and why."""
+        """One line that says whether the growth constant is proved, assumed or false in the box, and why.
+
+        It is false if a point or a pair refutes it, proved if a bound of all slopes is within it, assumed otherwise.
+        """
         region = f"in the box from {np.round(self.low, 4).tolist()} to {np.round(self.high, 4).tolist()}"
         if self.proved:
             return f"{self.name}: constant {self.constant:g} is proved {region} (no slope above {self.bound:.6g})"
@@ -231,11 +234,19 @@ def _search_slopes_and_pairs(
     high: Float[np.ndarray, "n"],
     random: np.random.Generator,
 ) -> tuple[Float[np.ndarray, "points n"], Float[np.ndarray, "pairs n+n"]]:
-    """Return points of large slopes in the box, and pairs (x, y) of large ratios |f(x) - f(y)| / |x - y|."""
+    """Return points of large slopes in the box, and pairs (x, y) of large ratios |f(x) - f(y)| / |x - y|.
+
+    Args:
+        meter: measures slopes and ratios of the function f.
+        starts: points of the box with which the search begins.
+        low: lower corner of the box.
+        high: upper corner.
+        random: generator of the search's moves.
+    """
     # Largest slope: the starts, then random moves from the steepest.
     points = _climb_at_random(meter.measure_slopes, starts, low, high, random)
     # Largest ratio: close pairs along the steepest directions, and as many pairs of any two points of the box.
-    move = meter.find_steepest_directions(points) * NEARBY * meter.width / 2
+    move = meter.find_steepest_directions(points) * NEARBY * meter.width / 2  # half of a pair's distance
     close = np.concatenate([np.clip(points - move, low, high), np.clip(points + move, low, high)], axis=1)
     far = low + (high - low) * random.random((POINTS, 2, len(low)))
     pairs = np.concatenate([close, far.reshape(POINTS, -1)])
@@ -243,7 +254,11 @@ def _search_slopes_and_pairs(
 
 
 def _compile_by_part(function: Callable[[Any], jax.Array]) -> Callable[[np.ndarray], np.ndarray]:
-    """Return a function of points, compiled for CLIMBERS * TRIALS (as many as a climb tries) at a time."""
+    """Return the function of points (count, n), compiled once, for a fixed number of points at a time.
+
+    A compiled program takes one shape alone; any other count is cut into parts. The number is CLIMBERS * TRIALS, as
+    many as one round of the search tries.
+    """
     compute = compile_in_float64(function)
 
     def call(points: np.ndarray) -> np.ndarray:

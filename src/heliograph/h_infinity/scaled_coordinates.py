@@ -264,14 +264,18 @@ def _rescale_step(
     """Return the step in scaled coordinates, with errors about the nominal gain.
 
     An H-infinity bound is a matrix inequality in the vector eta of state, error, unknown functions and disturbances;
-    its solver needs numbers of order one. A matrix M that maps eta to the error becomes S2^-1 M T, a quadratic form M
-    becomes T' M T.
+    its solver needs numbers of order one. With eta = T (scaled eta), x+ = S1 (scaled x+), e+ = S2 (scaled e+) and sizes
+    r of what is received,
+      x+ = X eta                         becomes  S1^-1 X T     (`state`),
+      e+ = E eta - K (received)          becomes  S2^-1 (E - K0 U) T, less a scaled correction of K0   (`error`),
+      received = U eta, deviations U_j   become   r^-1 U T and r^-1 U_j T   (`received`, `spreads`),
+      a quadratic form eta'F eta         becomes  T'F T   (`target` |M e|^2, `energy` |(v, rho)|^2, `growth`).
 
     Args:
         step: matrices of the step in the user's units.
         eta_scales: T of eta = T times scaled eta.
         state_scales: diag(S1, S2), the scales of (x, e) after the step: x = S1 times scaled x, e = S2 times scaled e.
-        received_scales: a scale for each received number.
+        received_scales: r, the size of each received number.
         form_scales: a scale for each growth form, a diagonal quadratic form that bounds an unknown function.
         nominal: the gain K0: the error's matrix becomes E - K0 U, where U maps eta to the received numbers.
     """

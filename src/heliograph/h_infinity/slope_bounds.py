@@ -77,17 +77,25 @@ def _sharpen_bound(
 def _bound_slopes(
     slopes: jax.extend.core.ClosedJaxpr, low: np.ndarray, high: np.ndarray
 ) -> Float[np.ndarray, " boxes"]:
-    """Return a bound of the Jacobian's norm over each box, infinite where the interval arithmetic says nothing."""
+    """Return a bound of the Jacobian's norm over each box, infinite where the interval arithmetic says nothing.
+
+    Interval arithmetic gives ends of each entry of J, so J = C +- R with the middle C and half the width R. Then
+    |J| <= |C| + |R| in the spectral norm.
+
+    Args:
+        slopes: program of the Jacobian J at BOXES points.
+        low: lower corners of the boxes (boxes, n).
+        high: upper corners.
+    """
     # The program is for BOXES boxes: fewer are padded.
     padding = BOXES - len(low)
     ends = [np.concatenate([end, np.repeat(end[-1:], padding, axis=0)]) for end in (low, high)]
     (jacobian,) = bound_program(slopes, [Interval(*ends)], continuous=False)
-    # |J| <= |C| + |R| for J in C +- R.
     is_finite = np.isfinite(jacobian.low) & np.isfinite(jacobian.high)
     lowest, highest = np.where(is_finite, jacobian.low, 0.0), np.where(is_finite, jacobian.high, 0.0)
-    centre = lowest / 2 + highest / 2
-    radius = np.nextafter(np.maximum(highest - centre, centre - lowest), np.inf)
-    norms = sum(np.linalg.norm(matrix, 2, axis=(-2, -1)) for matrix in (centre, radius))
+    C = lowest / 2 + highest / 2
+    R = np.nextafter(np.maximum(highest - C, C - lowest), np.inf)
+    norms = sum(np.linalg.norm(matrix, 2, axis=(-2, -1)) for matrix in (C, R))  # |C| + |R|
     return np.where(is_finite.all(axis=(1, 2)), norms * (1 + NORM_ROUNDING), np.inf)[: len(low)]
 
 

@@ -148,7 +148,9 @@ class JumpSystem(NamedTuple):
             for chain, maps, weight in zip(self.chain[::-1], self.maps[::-1], weights[::-1], strict=True):
                 derivative = weight + later  # by X after this step
                 derivatives.append(derivative)
-                later = mix_moments_of_modes(chain.T, propagate_by_mode(maps.swapaxes(-1, -2), derivative, 0.0))
+                # By X_i before it: sum_j T_ij F_j' (derivative by X_j) F_j.
+                by_mode = propagate_by_mode(maps.swapaxes(-1, -2), derivative, 0.0)
+                later = mix_moments_of_modes(chain.T, by_mode)
             return later[..., :modes_before, :, :], derivatives[::-1]
 
         later = np.zeros((modes_before, n, n))

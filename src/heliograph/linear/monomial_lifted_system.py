@@ -292,7 +292,10 @@ def _are_identical(left: AbstractRandomAffine, right: AbstractRandomAffine) -> b
 
 
 def initial_monomial_moments(plant: LinearPlant, order: int) -> Float[np.ndarray, "monomials"]:
-    """Return E[monomials of (x_0, 1)] of this order under the plant's law of x_0, a Gaussian one unless it is given."""
+    """Return E of all monomials of (x_0, 1) of a given order, products of so many factors, under the law of x_0.
+
+    It is the law that the plant holds, or else a Gaussian one.
+    """
     law = plant.deviation if plant.deviation is not None else Gaussian(plant.initial_covariance)
     # x_0 = (initial mean - the law's mean) + a draw of the law, as a homogeneous matrix.
     shift = np.eye(len(plant.states) + 1)
@@ -306,7 +309,8 @@ def refuse_lift(degree: int, states: int, outputs: int, horizon: int, modes: int
     if check_count("degree of the lift", degree) > HIGHEST:
         got = f"{degree}: binomials of twice the degree are no numbers of 64 bits"
         raise fail("degree of the lift", f"at most {HIGHEST}", got)
-    n, m = count_monomials(states + 1, degree), count_monomials(outputs + 1, degree)
+    n, m = count_monomials(states + 1, degree), count_monomials(outputs + 1, degree)  # the constant 1 among them
+    # At each step A and Cov(w), of n modes rows and columns; C; and Cov(v).
     entries = horizon * (2 * (n * modes) ** 2 + n * modes * m + m * m)
     of_modes = f" in {modes} modes" if modes > 1 else ""
     if entries > MEMORY_LIMIT_ENTRIES:

@@ -148,7 +148,8 @@ def with_flag(
     # Find the chain. `held`: all memories of the channel (chains, and gains that drift). Classes tell of the modes of a
     # single chain, so with several memories the chain must be given.
     held = list(memories(channel).values())
-    is_undecided = not held or (probabilities is not None and len(held) > 1)
+    are_classes = probabilities is not None
+    is_undecided = not held or (are_classes and len(held) > 1)
     if chain is None and is_undecided:
         raise fail("chain", "one that the flag tells of, since the channel does not hold just one", "none")
     # Without classes the states themselves are received.
@@ -245,5 +246,5 @@ def memory_matters(channel: Channel) -> bool:
 
 
 def uncertain_chain(channel: Channel) -> bool:
-    """Return whether a chain in the channel is known only within a radius."""
+    """Return whether a Markov chain in the channel has transition probabilities that are known only within bounds."""
     return any(memory.is_uncertain for memory in memories(channel).values())

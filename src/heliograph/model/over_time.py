@@ -41,17 +41,23 @@ class OverTime(Module):
 
 
 def _convert_leaf(leaf: object) -> object:
-    """Return numbers and lists as arrays of doubles, anything else as it is."""
+    """Return a leaf of a model: numbers and lists as arrays of doubles, anything else as it is."""
     return np.asarray(leaf, dtype=np.float64) if isinstance(leaf, int | float | list) else leaf
 
 
 def _list_arrays(tree: object) -> list[PyTree]:
-    """Return the arrays of a tree."""
+    """Return the arrays among the leaves of a model object."""
     return [leaf for leaf in jax.tree.leaves(tree) if eqx.is_array(leaf)]
 
 
 def stack(models: Sequence[T]) -> T:
-    """Stack model objects of one structure into one object whose arrays have a new leading axis."""
+    """Stack model objects of one structure into one object whose arrays have a new leading axis.
+
+    Everything that is no array must be the same in all of them, and is kept.
+
+    Raises:
+        ValueError: objects of different structures, or arrays of different shapes.
+    """
     leaves_and_structures = [jax.tree.flatten(model) for model in models]
     if len({_describe_structure(leaves, structure) for leaves, structure in leaves_and_structures}) != 1:
         raise fail("stack", "objects of one structure and one set of shapes", "objects that differ")
@@ -69,7 +75,7 @@ def structure_key(model: object) -> Hashable:
 
 
 def _describe_structure(leaves: Sequence[Any], tree: Hashable) -> Hashable:
-    """Return a key of a tree's form, the shapes of its arrays and its other leaves."""
+    """Return a hashable key of a flattened model: its tree, the shapes of its arrays, and its other leaves."""
     return tree, tuple(("array", leaf.shape) if eqx.is_array(leaf) else leaf for leaf in leaves)
 
 
@@ -140,7 +146,7 @@ def steps_covered(tree: object) -> int | None:
 
 
 def unstack(model: object) -> list[PyTree]:
-    """Return the object of each step, as `over_time` was given it; of one that does not vary this alone."""
+    """Return a list with the object of each step of an `OverTime`, or with the object alone if it does not vary."""
     return [at(model, i) for i in range(model.steps)] if isinstance(model, OverTime) else [model]
 
 
@@ -155,12 +161,15 @@ def list_models_by_step(model: PyTree, count: int) -> list[PyTree]:
 
 
 def stack_over_time(model: PyTree) -> PyTree:
-    """Return what varies over time as one object whose arrays have a first axis of time; another as it is."""
+    """Return the object inside an `OverTime`, whose arrays have a first axis of time; any other object as it is."""
     return model.values if isinstance(model, OverTime) else model
 
 
 def at_each_step(function: Callable[..., object], *items: object) -> PyTree:
-    """Return function(*items), or an `OverTime` of its results where some item varies."""
+    """Return function(*items); if some item is an `OverTime`, an `OverTime` of the function's result at each step.
+
+    Steps are as many as all varying items cover. So a function of constant models serves models that vary.
+    """
     steps = steps_covered(items)
     return function(*items) if steps is None else over_time([function(*at(items, k)) for k in range(steps)])
 

@@ -61,11 +61,13 @@ class InputsSideBySide(TransitionSideBySide):
 
     def __call__(self, u: jax.Array) -> jax.Array:  # type: ignore[override]
         """Return B (n, inputs) under the inputs u; a plant's rows are zero except in the columns of its own inputs."""
-        rows, plants = [], list[Any](self.plants)  # linear ones
+        rows_of_plants = []
+        plants: list[Any] = list(self.plants)  # linear ones
         for plant, own_inputs, columns in zip(plants, split_inputs(u, self.places), self.places, strict=True):
             matrix = jnp.asarray(matrix_under_inputs(plant.input_matrix, own_inputs))
-            rows.append(jnp.zeros((len(plant.states), len(u))).at[:, np.array(columns, int)].set(matrix))
-        return jnp.concatenate(rows)
+            no_inputs = jnp.zeros((len(plant.states), len(u)))
+            rows_of_plants.append(no_inputs.at[:, np.array(columns, int)].set(matrix))
+        return jnp.concatenate(rows_of_plants)
 
 
 def join(plants: "Sequence[AbstractPlant]") -> LinearPlant | Plant:

@@ -218,7 +218,13 @@ class LocalPlane(Module):
 
 
 def _read_coordinates(name: str, value: ArrayLike, *last: int) -> np.ndarray:
-    """Return an array whose last axes have the lengths `last`, after any leading axes; NaN stands for missing."""
+    """Return coordinates as an array (..., *last): any leading axes, and last axes of given lengths.
+
+    NaN stands for a missing coordinate. `name` is what the array is called in errors.
+
+    Raises:
+        ValueError: another shape, or no array of numbers.
+    """
     try:
         leading_axes = max(np.ndim(value) - len(last), 0)
     except ValueError:  # rows of different lengths, which the check names

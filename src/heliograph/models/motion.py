@@ -170,7 +170,7 @@ def known_turn(
     named = read_two_axes(axes)
     mean = np.zeros(4) if initial_mean is None else initial_mean
     start = WIDE * np.eye(4) if initial_covariance is None else initial_covariance
-    states = _keep_units(_name_states(named, 2))
+    states = _keep_units(_name_states(named, order=2))  # a position and a velocity for each axis
     return continuous_plant(motion, q * np.diag([0.0, 1.0, 0.0, 1.0]), mean, start, dt=dt, states=states)
 
 

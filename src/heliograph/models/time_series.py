@@ -38,8 +38,10 @@ class Component(Module):
     inputs: tuple[str, ...] = eqx.field(static=True)
 
     def __init__(self, name: str, plant: LinearPlant, loading: "Float[ArrayLike, ' n']", inputs: Sequence[str] = ()):
-        """Check and hold the name, the plant, the weights of its states and, of a regression, its inputs."""
+        """Check and hold a component of a series: `loading` @ (states of the plant).
 
+        `inputs`: for a regression, the input by which each state's weight is multiplied; none of all others.
+        """
         self.name = text("name of a component", name)
         self.plant = instance("plant of a component", plant, LinearPlant, "a LinearPlant")
         self.loading = array("loading of a component", loading, (len(plant.states),))

@@ -96,7 +96,10 @@ def join_gains(network: RelayNetwork, gains: GainsByFilter) -> Float[np.ndarray,
 def split_gains(
     network: RelayNetwork, joined: Float[np.ndarray, "steps Fn R"]
 ) -> dict[str, Float[np.ndarray, "steps n _"]]:
-    """Return the gains by filter from block matrices for each step: the inverse of `join_gains`."""
+    """Return the gains (steps, n, received) of each filter from block matrices: the inverse of `join_gains`.
+
+    Rows of a block matrix are by filter and state, columns are the R received numbers, by filter.
+    """
     n, ends = len(network.states), np.cumsum(network.received)
     return {
         name: np.asarray(joined)[:, f * n : (f + 1) * n, end - size : end]
@@ -105,12 +108,16 @@ def split_gains(
 
 
 def make_design(network: RelayNetwork, propagated: PropagatedMoments) -> RelayDesign:
-    """Return the design with the propagated gains and moments; raise ValueError unless all moments are finite."""
+    """Return the design of a network from its gains, moments and powers over time, taken apart by filter.
+
+    Raises:
+        ValueError: moments that are not finite.
+    """
     moments, n = np.asarray(propagated.moments), len(network.states)
     if not np.all(np.isfinite(moments)):
         step = int(np.argmax(~np.isfinite(moments).all(axis=(1, 2))))
         raise fail("design", "finite second moments", f"some that are not after step {step} (is a link noiseless?)")
-    # The moments are of (x, e_1 .. e_F), e_f the error of filter f. The power is by sender, of which the first is y's.
+    # The moments are of (x, e_1 .. e_F), e_f the error of filter f. Power is by sender: the sensor, then the relays.
     blocks = {name: slice((1 + f) * n, (2 + f) * n) for f, name in enumerate(network.filters)}
     return RelayDesign(
         gains=split_gains(network, np.asarray(propagated.gains)),
@@ -256,7 +263,13 @@ def local_error_design(network: RelayNetwork, horizon: int) -> RelayDesign:
 
 
 def relay_gains(network: RelayNetwork, gains: GainsByFilter) -> Float[np.ndarray, "steps Fn R"]:
-    """Return the block matrices (`join_gains`) of the relays' gains, zero for the receiver, which comes last."""
+    """Return the relays' gains as one block matrix for each step, with zeros for the receiver's gain.
+
+    Rows are by filter and state, columns are the R received numbers, by filter; the receiver's come last.
+
+    Raises:
+        ValueError: a network without relays, a relay without gains, gains of another shape.
+    """
     gains = table("relay gains", gains, "arrays")
     missing = [name for name in network.relays if name not in gains]
     if missing or not network.relays:

@@ -100,9 +100,13 @@ def _sweep_backward(
     def step_back(
         later: jax.Array, row: tuple[RelaySteps, jax.Array, jax.Array, jax.Array]
     ) -> tuple[jax.Array, jax.Array]:
-        """Return the cost's gradient by the moments before a step, and Lam, its gradient by the moments after it."""
+        """Return the cost's gradient by the moments before a step, to go on with, and that by the moments after it.
+
+        `later` is the gradient of the cost of later steps by the moments after this one. A row has the step, its old
+        gain, the moments before the correction, and the matrix of the step's own cost.
+        """
         step, gain, uncorrected, own_cost = row
-        lam = later + own_cost  # of later steps' cost, and of the step's own
+        lam = later + own_cost  # the gradient by the moments after this step, of later steps' cost and its own
         best_gain = minimise_cost_ahead(uncorrected, lam, gain, step)
         return moment_adjoint(step, best_gain, lam), lam
 
@@ -130,7 +134,10 @@ def _sweep_forward(
     def improve_step(
         moments: jax.Array, row: tuple[RelaySteps, jax.Array, jax.Array]
     ) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
-        """Return the moments after a step with its best gain, and the pair (best gain, these moments) to collect."""
+        """Return the moments after a step with its best gain, and the pair (best gain, these moments) to collect.
+
+        `moments` are those before the step; a row has the step, its old gain, and the gradient of the cost.
+        """
         step, old_gain, gradient = row  # the gradient of the cost by the moments after the step
         uncorrected, _ = step_moments(step, moments)
         gain = minimise_cost_ahead(uncorrected, gradient, old_gain, step)
@@ -163,7 +170,10 @@ def _alternate_sweeps(
     """
 
     def sweep(search: SweepState, _: jax.Array) -> tuple[SweepState, None]:
-        """Sweep backward and forward once; keep the best gains so far with their cost, sum_k <cost_k, moments_k>."""
+        """Return the search after one more sweep backward and forward, with the best gains so far and their cost.
+
+        The cost is sum_k <cost_k, covariance after step k>, <A, B> the sum of A_ij B_ij.
+        """
         gradients = _sweep_backward(steps, start, cost, search.gains)  # of the cost by the covariance after each step
         gains, moments = _sweep_forward(steps, start, search.gains, gradients)
         new_cost = jnp.sum(cost * moments)

@@ -260,7 +260,7 @@ def _repeat_until_steady(
 
     def repeat(carry: RepeatedPeriods) -> RepeatedPeriods:
         """Return the value after one more `period`, its change (relative to its largest entry), and their count."""
-        value, _change_before, count = carry
+        value, _change_before, count = carry  # a matrix, its last change, and the number of periods so far
         value_after = period(value)
         size = jnp.maximum(jnp.max(jnp.abs(value_after)), np.finfo(float).tiny)
         change = jnp.max(jnp.abs(value_after - value)) / size

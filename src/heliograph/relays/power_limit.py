@@ -246,7 +246,11 @@ def _choose_step_units(
     def step_back(
         later: jax.Array, row: tuple[RelaySteps, jax.Array, jax.Array, jax.Array]
     ) -> tuple[jax.Array, jax.Array]:
-        """Return the cost's gradient by the moments before a step, and the units in which the step's gains change."""
+        """Return the cost's gradient by the moments before a step, and the units in which the step's gains change.
+
+        `later` is the gradient of the cost of later steps by the moments after this one. A row has the step, its gain,
+        the moments before it, and the gradient of its own cost and barrier by the moments after it.
+        """
         step, gain, moments_before, gradient_of_step = row
         # Lam, the gradient by the moments after the step: of the cost of later steps, and of this step's own.
         lam = later + gradient_of_step

@@ -174,7 +174,10 @@ def _list_receiver_views(
     """
 
     def move(moments: jax.Array, row: tuple[RelaySteps, jax.Array]) -> tuple[jax.Array, ReceiverViewOfRelays]:
-        """Return the moments of x and all filters' errors after a step, and the system that the receiver observes."""
+        """Return the moments of x and all filters' errors after a step, and the system that the receiver observes.
+
+        `moments` are those before the step; a row has the step and the gains of all filters in it.
+        """
         step, gain = row
         uncorrected, _ = step_moments(step, moments)
         # Corrected by the gains, without those on numbers that no link brings in this slot.

@@ -77,7 +77,10 @@ class AssumedModel:
 
 
 class StaticAssumedModel:
-    """An assumed model as a static field of a tree of arrays: all are equal, so that none decides what is compiled.
+    """An assumed model as a static field of a filter, which is a tree of arrays.
+
+    JAX compiles a program anew for another static field. All objects of this class count as equal, so that filters
+    which differ in their assumed model alone share one program.
 
     lowered: whether the claim was lowered, since the filter runs in another world than its assumed model.
     """
@@ -87,11 +90,11 @@ class StaticAssumedModel:
         self.assumed, self.lowered = assumed, lowered
 
     def __eq__(self, other: object) -> bool:
-        """Return True for any other assumed model."""
+        """Return True for any other object of this class, so that no assumed model decides what is compiled."""
         return isinstance(other, StaticAssumedModel)
 
     def __hash__(self) -> int:
-        """Return the hash that all assumed models have."""
+        """Return the same hash for all assumed models, since they count as equal."""
         return hash(StaticAssumedModel)
 
 
@@ -103,7 +106,7 @@ class HasAssumedModel(Protocol):
 
     @property
     def kept(self) -> StaticAssumedModel:
-        """The assumed model as it is kept."""
+        """The models for which it was made, wrapped so that they do not decide what is compiled."""
 
 
 B = TypeVar("B", bound=HasAssumedModel)

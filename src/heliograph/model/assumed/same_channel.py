@@ -23,7 +23,9 @@ from heliograph.random_affine.series_and_stack import Series
 
 
 def same_channel(a: Channel, b: Channel, order: int | None, loses: bool) -> bool:
-    """Return whether two channels agree; memories at the same place count as the same.
+    """Return whether a filter that was made for the channel a is right for the channel b too.
+
+    Names of memories (such as fadings) are not compared: memories at the same place count as the same.
 
     Args:
         a: a channel, constant or over time.
@@ -126,14 +128,16 @@ def _moments_agree(a: Moments, b: Moments, arrived: np.ndarray) -> bool:
     """Return whether the moments of the components that arrived are equal to rounding (EQUAL), relative to their size.
 
     a and b are each E[(G, n)] (m, p + 1), and E[z z' | y] as a tensor (m, m, p + 1, p + 1) acting on (y, 1) (y, 1)'.
+    The size of an entry H_ia of H = (G, n) is E[H_ia^2]^(1/2), the larger of those of a and b.
     """
     (mean_a, second_a), (mean_b, second_b) = a, b
     rows = np.ix_(arrived, arrived)
-    powers = [np.abs(np.einsum("iiaa->ia", second))[arrived] for second in (second_a, second_b)]
-    size = np.sqrt(np.maximum(*powers))
-    scale = size[:, None, :, None] * size[None, :, None, :]
+    squares = [np.abs(np.einsum("iiaa->ia", second))[arrived] for second in (second_a, second_b)]  # E[H_ia^2]
+    size = np.sqrt(np.maximum(*squares))
+    size_of_product = size[:, None, :, None] * size[None, :, None, :]  # of H_ia H_jb, at [i, j, a, b]
     means_agree = np.all(np.abs(mean_a - mean_b)[arrived] <= EQUAL * size)
-    return bool(means_agree and np.all(np.abs(second_a[rows] - second_b[rows]) <= EQUAL * scale))
+    seconds_agree = np.all(np.abs(second_a[rows] - second_b[rows]) <= EQUAL * size_of_product)
+    return bool(means_agree and seconds_agree)
 
 
 def same_observation(

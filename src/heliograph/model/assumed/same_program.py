@@ -65,7 +65,11 @@ def _same_program(a: core.Jaxpr, b: core.Jaxpr) -> bool:
 
 
 def _number_variables(names: tuple[dict[Any, int], dict[Any, int]], a: Sequence[Any], b: Sequence[Any]) -> None:
-    """Give the variables of both programs, a and b, their next numbers, in place."""
+    """Number the variables a of one program and b of the other in the order given, after those numbered before.
+
+    `names` has for each program the number of each variable, and is changed in place. Variables of two programs that
+    have the same number play the same part.
+    """
     for known, variables in zip(names, (a, b), strict=True):
         known.update({variable: len(known) + i for i, variable in enumerate(variables)})
 

@@ -108,7 +108,11 @@ def with_clocks(
 
 
 def _read_step_length(plant: AbstractPlant, dt: ArrayLike | str) -> Any:
-    """Return the checked time of a step, which is not negative, or the name of the plant's input that holds it."""
+    """Return the length of a step: a number, or the name of the plant's input that says it.
+
+    Raises:
+        ValueError: a negative number, or a name that is no input of the plant.
+    """
     if not isinstance(dt, str):
         return scalar("time of a step", dt, 0.0)
     if dt not in plant.inputs:
@@ -164,9 +168,14 @@ def _make_clock_plant(clocks: Mapping[str, Clock], dt: str | Any) -> LinearPlant
 def _make_stamped_sensor(
     sensor: AbstractSensor, motion: Motion, states: int, total: int, offset: int | None
 ) -> LinearSensor | StampedSensor:
-    """Return the sensor for a state of `total` components, of which the first `states` are those that it measures.
+    """Return a node's sensor for the larger state: the plant's states, then offset and drift of each clock.
 
-    `offset`: the place of its clock's offset; None of a sensor whose clock is right.
+    Args:
+        sensor: the node's sensor of the plant's states.
+        motion: dx/dt of the plant's states, a function or a matrix; by it a wrong time stamp becomes an error of y.
+        states: number of the plant's states, which stand first.
+        total: number of all states.
+        offset: index of the offset of this node's clock; None for a node whose clock is right, which needs no motion.
     """
     if offset is None and isinstance(sensor, LinearSensor):
         matrix = library(sensor.matrix).pad(sensor.matrix, ((0, 0), (0, total - states)))
@@ -176,7 +185,7 @@ def _make_stamped_sensor(
         noise=sensor.noise,
         motion=motion if offset is not None else None,
         states=states,
-        offset=offset or 0,
+        offset=offset or 0,  # not used where the clock is right
         outputs=sensor.outputs,
         circular=sensor.circular,
     )

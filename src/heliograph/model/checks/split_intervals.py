@@ -57,8 +57,9 @@ def explain_uneven_prediction(plant: AbstractPlant, dt: int) -> str:
     cuts = np.array(CUTS)
     # At the initial mean, and one standard deviation from it.
     for x in (mean, mean + deviation):
-        # f, A and Q over s + t at once, and over s and then t, for every cut (s, t).
-        whole = _predict_over_intervals(plant, dt, x, cuts.sum(axis=1, keepdims=True))
+        # f, A and Q, each with an axis of cuts: over s + t as one interval, and over s and then t.
+        sums = cuts.sum(axis=1, keepdims=True)  # s + t of each cut (s, t)
+        whole = _predict_over_intervals(plant, dt, x, sums)
         parts = _predict_over_intervals(plant, dt, x, cuts)
         for i, (s, t) in enumerate(CUTS):
             for what, at_once, in_two in zip(("transition", "Jacobian", "noise"), whole, parts, strict=True):

@@ -75,12 +75,15 @@ def count_repeats(z: Float[np.ndarray, "time m"], before: Repeats) -> tuple[Int[
         rows = np.flatnonzero(~np.isnan(z[:, i]))
         if len(rows) == 0:
             continue
-        readings, place = z[rows, i], np.arange(len(rows))
-        begins = readings != np.concatenate([[newest[i]], readings[:-1]])
-        # Place where the present run began; that of the run before these rows is before the first.
-        start = np.maximum.accumulate(np.where(begins, place, -lengths[i]))
-        counts[rows, i] = place - start + 1
-        newest[i], lengths[i] = float(readings[-1]), int(counts[rows[-1], i])
+        readings = z[rows, i]  # of this component, those that arrived
+        number = np.arange(len(rows))
+        begins = readings != np.concatenate([[newest[i]], readings[:-1]])  # a run: another reading than before it
+        # Number of the reading with which the present run began. A run that goes on from before these readings began
+        # with number -length: its readings before have the numbers -length to -1.
+        start = np.maximum.accumulate(np.where(begins, number, -lengths[i]))
+        counts[rows, i] = number - start + 1
+        newest[i] = float(readings[-1])
+        lengths[i] = int(counts[rows[-1], i])
     return counts, Repeats(tuple(newest), tuple(lengths))
 
 
@@ -192,7 +195,18 @@ def find_stuck_counts(
 def _find_counts_by_noise_law(
     received: int, sensor: AnySensor | None, channel: Channel | None
 ) -> Float[np.ndarray, " received"]:
-    """Return the counts by the noise and resolution of a sensor, the largest of all its steps."""
+    """Return after how many equal readings each output of a sensor counts as stuck, by its noise and resolution.
+
+    Runs as long have the probability SELDOM by chance; of a sensor that varies over time the largest count holds.
+
+    Args:
+        received: how many numbers are received.
+        sensor: the sensor, with a resolution.
+        channel: its channel.
+
+    Raises:
+        ValueError: no sensor or channel, a channel that changes readings, noise by which equal readings are usual.
+    """
     steps = [step for step in unstack(sensor) if isinstance(step, AbstractSensor)]
     if not steps or channel is None:
         raise fail("stuck", "a number of equal readings, of what is received from no sensor", "True")

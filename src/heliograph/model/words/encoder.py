@@ -115,7 +115,7 @@ class Words(Module):
                 raise fail(f"{name} of the words", f"one number, or {outputs}", f"shape {np.shape(end)}")
 
     def each(self, values: Float[np.ndarray, "..."], outputs: int) -> Float[np.ndarray, " outputs"]:
-        """Return numbers that all components share, or that each has, as one for each."""
+        """Return an array (outputs,) of one number for each component, from one number for all or one for each."""
         values_of_outputs: np.ndarray = library(values).broadcast_to(values, (outputs,))
         return values_of_outputs
 
@@ -135,12 +135,15 @@ class Words(Module):
                 return jnp.asarray(self.step) * (uniform[0] - 0.5)
 
     def index(self, y: jax.Array) -> jax.Array:
-        """Return the number i of the word nearest to each component of y, a whole number as a float."""
+        """Return the number i of the word nearest to each component of y, a whole number as a float.
+
+        Beyond the range it is that of the end word.
+        """
         place = jnp.floor((y - jnp.asarray(self.low)) / jnp.asarray(self.step) + 0.5)
         return jnp.clip(place, 0.0, 2.0**self.bits - 1)
 
     def word(self, index: jax.Array) -> jax.Array:
-        """Return the word of number i."""
+        """Return the word q = low + i D of each component from its number i."""
         return jnp.asarray(self.low) + index * jnp.asarray(self.step)
 
     def signs(self, index: jax.Array) -> Float[jax.Array, "outputs bits"]:
@@ -196,7 +199,7 @@ class Words(Module):
 
 
 def _read_range_end(name: str, value: ArrayLike) -> Float[np.ndarray, "..."]:
-    """Return an end of the range, of all components or one for each."""
+    """Return the low or high end of the words' range as an array: one number for all components, or one for each."""
     return cast(np.ndarray, array(f"{name} of the words", value, (None,) if rank(name, value) else ()))
 
 

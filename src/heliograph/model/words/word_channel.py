@@ -79,7 +79,10 @@ def rewrite_about_centres(encoder: Words, channel: Channel) -> Channel:
     """
 
     def convert(link: AbstractRandomAffine) -> AbstractRandomAffine:
-        """Return the link of one step as a map of the numbers q - c, one for each component of y."""
+        """Return a link of codewords as a map of one number q - c for each, q the word and c the range's centre.
+
+        A link that flips bits needs the variance U of a word, which `encoder.power` gives for each component of y.
+        """
         power = encoder.each(encoder.power, signal_size(link))  # U by component of y
         form = WordForm(
             flips=lambda flips, components: flips.about_centre(power[list(components)]), selection=known, size=1
@@ -132,12 +135,13 @@ def _rewrite_map(link: AbstractRandomAffine, components: Components, form: WordF
         form: how flips and selections are written, and how many numbers a codeword is.
     """
     match link:
-        case Flips():
+        case Flips():  # flips bits of codewords, and neither selects nor moves them
             return RewrittenMap(form.flips(link, components), components)
         case GainAndNoise():
             return _rewrite_selection(link, components, form)
-        case ModeOutput():  # tells the present mode of a memory; its outputs are flags, which stand for no component
-            return RewrittenMap(ModeOutput(link.memory, link.sent * form.size), (FLAG,) * link.outputs)
+        case ModeOutput():  # reports the mode of a fading whatever is sent: its outputs are flags, and no codewords
+            numbers_sent = link.sent * form.size
+            return RewrittenMap(ModeOutput(link.memory, numbers_sent), (FLAG,) * link.outputs)
         case Series():
             return _rewrite_series(link, components, form)
         case Stack():
