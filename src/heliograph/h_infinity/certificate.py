@@ -98,8 +98,7 @@ def certify_level(
     matrices = [make_theorem_matrix(system, k, K[k], P[k], P[k + 1], lam[k], level) for k in range(T)]
     largest = np.array([_largest_eigenvalue(phi) for phi in matrices])
     negative = np.array([is_negative_definite(phi) for phi in matrices])
-    # Initial condition level^2 W - P_0 > 0, and how far all these are from failing: eigenvalues in units of the
-    # diagonal, so that the user's units do not matter.
+    # Initial condition level^2 W - P_0 > 0, and how far all these are from failing, in units of the diagonals.
     allowed = level**2 * system.initial_weight
     initial = float(np.linalg.eigvalsh(allowed - P[0])[0])
     initial_margin = smallest_eigenvalue(allowed - P[0], np.sqrt(np.diagonal(allowed)))
@@ -162,11 +161,11 @@ def _list_positive(constants: Float[np.ndarray, "steps"]) -> list[float]:
 
 
 def _list_assumed_constants(letter: str, growth: Growth, findings: Sequence[GrowthFinding]) -> list[str]:
-    """List a function's constants that no finding proves.
+    """Return in words the growth constants of a function, called by a `letter`, that no finding proves.
 
-    A finding bounds the slopes in a box, and so the differences of the function in it. If 0 is in the box
-    (`finding.around_zero`) and f(0) = 0, it bounds the function itself too. `growth.state` and `growth.error` hold the
-    constants of f itself and of its differences.
+    A finding is the result of `check_growth`. It bounds the slopes in a box, and so the differences of the function in
+    it. If 0 is in the box (`finding.around_zero`) and f(0) = 0, it bounds the function itself too. `growth.state` and
+    `growth.error` hold the constants of f itself and of its differences.
     """
     around_zero = [finding for finding in findings if finding.around_zero]
     of_function, of_differences = f"|{letter}(x)| <= a |x|", f"|{letter}(x) - {letter}(y)| <= a |x - y|"
@@ -232,10 +231,10 @@ def make_theorem_matrix(
     q = 4 * n + 2 * y + v + r
 
     def rows(height: int, **blocks: np.ndarray) -> Float[np.ndarray, "{height} q"]:
-        """Return rows over eta, q long, that multiply its parts by these blocks, given by the letter of the part.
+        """Return a matrix of `height` rows over eta that has these blocks, each in the columns of a part of eta.
 
-        eta is the vector of all that a step depends on. `at` gives the first index of each part by its letter. Parts
-        without a block get zeros.
+        eta, of length q, is the vector of all that a step depends on. `at` gives the first index of each part by its
+        letter, the name of the block. Parts without a block get zeros: rows(n, x=A) @ eta is A x.
         """
         matrix = np.zeros((height, q))
         for name, block in blocks.items():
@@ -332,7 +331,7 @@ def _largest_eigenvalue(phi: Float[np.ndarray, "q q"]) -> float:
 
 
 def is_negative_definite(phi: Float[np.ndarray, "q q"]) -> bool:
-    """Decide whether a symmetric matrix is negative definite beyond rounding, after scaling its diagonal to -1.
+    """Return whether a symmetric matrix Phi is negative definite beyond rounding, after scaling its diagonal to -1.
 
     Scaling preserves definiteness and lets weights of very different sizes stand in one matrix.
     """
@@ -340,9 +339,10 @@ def is_negative_definite(phi: Float[np.ndarray, "q q"]) -> bool:
 
 
 def _find_scaled_largest(phi: Float[np.ndarray, "q q"]) -> float:
-    """Return the largest eigenvalue of Phi after scaling its diagonal to -1; infinity if the diagonal is not negative.
+    """Return the largest eigenvalue of a symmetric Phi after scaling its diagonal to -1, by s_i s_j on entry ij.
 
-    It has the same sign as the largest eigenvalue of Phi itself, and does not depend on units.
+    It is infinite if the diagonal is not negative, since Phi is then not negative definite. It has the same sign as the
+    largest eigenvalue of Phi itself, and does not depend on units.
     """
     diagonal = np.diagonal(phi)
     if not np.all(diagonal < 0):

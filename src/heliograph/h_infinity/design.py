@@ -113,7 +113,7 @@ def recursive_design(
     tried: dict[float, HInfinityDesign] = {}
 
     def is_feasible(trial: float) -> bool:
-        """Return whether the recursion succeeds at a level; keep its design."""
+        """Return whether the recursion succeeds at a level, `trial`; its design is kept in `tried`."""
         tried[trial] = recursion.run(trial, start)
         return tried[trial].feasible
 
@@ -159,8 +159,7 @@ def horizon_design(
     layouts = [UnknownsLayout(n, m, len(s.growth), given_correction) for s in steps]
     start = None if initial is None else coordinates.scale_initial_weight(_check_initial_weight(initial, n))
     allowed = coordinates.unit**2 * coordinates.scale_initial_weight(system.initial_weight)
-    # One convex problem in all weights, gains, multipliers and the level squared. A solution is a vector: the level
-    # squared, then the unknowns of each step.
+    # One convex problem in all weights, gains, multipliers and the level squared.
     problem = HorizonProblem(steps, layouts, allowed, start)
     status = run_solver(problem.problem, solver)
     values = problem.unknowns.value
@@ -178,8 +177,7 @@ def horizon_design(
         text = f"the solver's answer fails at step {failed} ({status})"
         return _make_unsolved_design(system, separate, float("nan"), text)._replace(failed_step=failed)
     # Back to the user's units.
-    gains_of_steps = [steps[k].nominal + _gain_correction(unknowns) for k, unknowns in enumerate(solved)]
-    found = [coordinates.unscale_gain(gain, k) for k, gain in enumerate(gains_of_steps)]
+    found = [coordinates.unscale_gain(steps[k].nominal + _gain_correction(u), k) for k, u in enumerate(solved)]
     multipliers = np.array([coordinates.unscale_multipliers(u, k) for k, u in enumerate(solved)])
     return HInfinityDesign(
         level=float(np.sqrt(level_squared)) * coordinates.unit,
@@ -350,7 +348,7 @@ def _weigh_state_and_error(unknowns: Unknowns) -> Float[np.ndarray, "w w"]:
 
 
 def _make_unsolved_design(system: GrowthSystem, separate: bool, level: float, status: str) -> HInfinityDesign:
-    """Return a design that is not feasible: all its arrays are NaN, and it has the solver's status.
+    """Return a design at a level that is not feasible, or not yet: all its arrays are NaN, and it has a status.
 
     With `separate` each of the four functions f, f~, h, h~ has a multiplier. Else (f, f~) share one, and (h, h~) too.
     """

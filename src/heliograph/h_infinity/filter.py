@@ -62,15 +62,16 @@ class HInfinityFilter(AbstractSizedFilter):
 
     @predicts
     def predict(self, state: PendingCorrection, u: ArrayLike = (), k: Step = 0) -> PendingCorrection:
-        """Predict over step k, corrected with the measurements before it."""
+        """Return xhat+ = f(xhat, u) + the correction that the last measurement made; no correction is pending then."""
         mean = at(self.plant, k).transition(state.mean, jnp.asarray(u)) + state.correction
         return PendingCorrection(mean, jnp.zeros_like(mean))
 
     @corrects
     def correct(self, state: PendingCorrection, z: ArrayLike, k: Step = 0) -> tuple[PendingCorrection, Innovation]:
-        """Compute the correction of the next estimate from z; the current estimate does not change.
+        """Return the state with the correction of the next estimate by z, and the innovation.
 
-        The correction is the gain of step k times (z - mean gain h(x)). A number that did not arrive adds nothing.
+        This is a filter in predictor form: z changes the next estimate, and the present one stays. The correction is
+        the gain of step k times (z - mean gain h(xhat)). A number that did not arrive (NaN) adds nothing.
         """
         value = jnp.asarray(z) - at(self.expected_gain, k) @ at(self.sensor, k).measure(state.mean)
         correction = at(self.gains, k) @ jnp.where(jnp.isnan(value), 0.0, value)

@@ -84,7 +84,10 @@ def point_interval(value: object) -> Interval:
 
 
 def round_outward(low: object, high: object, ulps: int = 1) -> Interval:
-    """Return the interval with its ends moved outward by `ulps` units in the last place; a NaN end is infinite."""
+    """Return the interval [low, high] with its ends moved outward by `ulps` units in the last place.
+
+    So it holds what exact arithmetic would have given. An end that is NaN, of which nothing is known, becomes infinite.
+    """
     low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
     low, high = np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high)
     for _ in range(ulps):
@@ -206,7 +209,7 @@ def _select_case(x: list[Interval]) -> Interval:
 
 
 def _bound_product(a: Interval, b: Interval) -> tuple[Numbers, Numbers]:
-    """Return the least and the largest product of ends, not rounded outward."""
+    """Return the least and the largest product x y of x in a and y in b, which are products of ends; not rounded."""
     ends = [x * y for x in a for y in b]
     # An infinite end stands for finite numbers, and 0 times each of them is 0.
     ends = [np.where(np.isnan(end), 0.0, end) for end in ends]
@@ -239,9 +242,10 @@ def _bound_square(a: Interval) -> Interval:
 
 
 def _raise_interval_to_power(a: Interval, exponent: int) -> Interval:
-    """Return an interval of x^k for a whole number k.
+    """Return an interval of x^k for x in a and a whole number k, the `exponent`.
 
-    Even powers depend on |x| alone. A power may be off by ULPS units in the last place.
+    Odd powers are monotone; even ones depend on |x| alone, and are monotone in it. x^-k is 1 / x^k. A power may be off
+    by ULPS units in the last place.
     """
     if exponent < 0:
         unit_interval = point_interval(np.ones_like(a.low))

@@ -134,8 +134,9 @@ def _nearest_power_of_four(size: Float[np.ndarray, "*n"] | float) -> Float[np.nd
 def _choose_state_scales(x: np.ndarray, e: np.ndarray, nothing_grows: bool) -> Float[np.ndarray, "w w"]:
     """Return scales diag(S1, S2) of x and e from their covariances.
 
-    x is the state and e the error. Where nothing grows, S1 and S2 are factors of the covariances. Else they are
-    multiples of I, since a growth bound such as |f(x)| <= a |x| keeps its meaning under these alone.
+    x is the state and e the error. `nothing_grows` says that plant and sensor have no unknown functions. Then S1 and S2
+    are factors of the covariances. Else they are multiples of I, since a growth bound such as |f(x)| <= a |x| keeps its
+    meaning under these alone.
     """
     if nothing_grows:
         return np.asarray(block_diag(_factor_with_floor(x), _factor_with_floor(e)))

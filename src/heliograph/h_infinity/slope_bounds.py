@@ -100,7 +100,13 @@ def _bound_slopes(
 
 
 def _halve_boxes(low: np.ndarray, high: np.ndarray, width: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return every box in two, halved across its widest side relative to `width`, the sides of the whole region."""
+    """Return the lower and the upper corners of twice as many boxes: each is halved across its widest side.
+
+    Args:
+        low: lower corners of the boxes (boxes, n).
+        high: upper corners.
+        width: lengths of the sides of the whole region (n,), relative to which a side is wide.
+    """
     sides = np.argmax((high - low) / np.where(width > 0, width, 1.0), axis=1)
     rows = np.arange(len(low))
     middle = (low[rows, sides] + high[rows, sides]) / 2

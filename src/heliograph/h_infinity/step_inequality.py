@@ -329,7 +329,8 @@ def make_linear_forms(step: StepMatrices, layout: UnknownsLayout) -> LinearForms
 def make_weight_form(layout: UnknownsLayout) -> Float[np.ndarray, "ww size"]:
     """Return the linear map from the vector of unknowns to diag(P1, P2), written row by row.
 
-    P1, P2: weights of state and error after the step.
+    P1 and P2 are the weights of state and error after the step. `layout` says where they stand in the vector. A linear
+    map's columns are its values at the unit vectors.
     """
     units = [layout.unpack(unit) for unit in np.eye(layout.size)]
     first_block, second_block = np.diag([1.0, 0.0]), np.diag([0.0, 1.0])
@@ -342,8 +343,14 @@ def find_independent_parts(
 ) -> list[Int[np.ndarray, "_"]]:
     """Return sets of indices of eta between which all entries of Phi are zero, whatever the unknowns are.
 
-    So Phi < 0 splits into a smaller inequality for each set. Phi (q, q) is the matrix of the step's inequality in eta,
-    which begins with x and e of n components each. `start` is the weight before the step if it is not diag(P1, P2).
+    So Phi < 0 splits into a smaller inequality for each set, which a solver solves faster. They are the connected parts
+    of the graph of Phi's entries that may not be zero. Phi (q, q) is the matrix of the step's inequality in eta, which
+    begins with x and e of n components each.
+
+    Args:
+        step: matrices of the step.
+        forms: Phi's part that is linear in the unknowns, `forms.next`.
+        start: the weight before the step if it is not diag(P1, P2).
     """
     q = len(step.energy)
     are_coupled = np.any(forms.next != 0, axis=1).reshape(q, q) | (step.target != 0) | (step.energy != 0)

@@ -132,7 +132,8 @@ def _iterate_covariances(system: KnownLossSystem) -> KindGains:
     """
     size = float(np.trace(system.process)) or 1.0  # without process noise any size serves
     V: ModeCovariances = system.law[:, None, None] * (system.process + size * np.eye(len(system.transition)))
-    noise, gains = 1.0, _improve_gains(system, V, noise=1.0)  # `noise` scales the covariances of all noises
+    noise = 1.0  # factor of the covariances of all noises
+    gains = _improve_gains(system, V, noise)
     for step in range(1, ITERATIONS + 1):
         (V,) = system.close_loop(gains, noise).after(V)
         growth = np.trace(V.sum(axis=0)) / size
@@ -176,8 +177,8 @@ def _fastest_growing_covariances(shape: tuple[int, ...], values: np.ndarray, vec
     """Return the covariances V (modes, n, n) that a step without noise multiplies by its spectral radius, of trace 1.
 
     `values` and `vectors` are the eigenvalues and eigenvectors of the step V -> V+, which acts on the entries of upper
-    triangles. It maps covariances to covariances, so (Perron and Frobenius) its largest eigenvalue is real, with
-    covariances as eigenvector. A small multiple of I makes them invertible.
+    triangles; `shape` is that of V. It maps covariances to covariances, so (Perron and Frobenius) its largest
+    eigenvalue is real, with covariances as eigenvector. A small multiple of I makes them invertible.
     """
     V = unpack_triangle_entries(np.real(vectors[:, np.argmax(values.real)]), shape)
     return np.asarray(V / np.trace(V.sum(axis=0)) + np.eye(shape[-1]) / NEGLIGIBLE)

@@ -46,7 +46,7 @@ class LiftedMap:
         self.highest_degree[~has_known_gains[:, None] & ~has_known_gains] = 2 * degree
 
     def push_moments(self, moments: Float[Array, "M"]) -> Float[np.ndarray, "L"]:
-        """Return E[monomials of z] from E[monomials of y], both up to twice the degree."""
+        """Return E[monomials of z] from `moments`, E[monomials of y], both up to twice the degree of the lift."""
         with np.errstate(over="ignore", invalid="ignore"):  # the caller refuses what overflows
             if self.moment_matrix is not None:
                 return np.asarray(self.moment_matrix @ np.asarray(moments))

@@ -54,6 +54,12 @@ class CarriedRounding(NamedTuple):
         D and R are the roundings of Cov(w) and Cov(v), both diagonal. G is the gain, and F = (I - G C) A. The roundings
         change the gain too, but that adds nothing to first order, since the gain minimises the covariance. The largest
         share that X has had of a claimed variance is kept, with its step.
+
+        Args:
+            system: y+ = A y + a + w, z = C y+ + c + v, with the roundings of Cov(w) and Cov(v) at each step.
+            k: the step.
+            matrices: A, C and so on of this step.
+            gains: the filter's gain and claimed covariance at this step.
         """
         I_GC = np.eye(len(gains.gain)) - gains.gain @ matrices.output
         rounding = gains.transition @ self.covariance @ gains.transition.T
@@ -63,14 +69,17 @@ class CarriedRounding(NamedTuple):
         variance = np.diag(system.projection @ rounding @ system.projection.T)
         claimed_variance = np.maximum(np.diag(gains.covariance), variance)
         shares = np.divide(variance, claimed_variance, out=np.zeros_like(variance), where=variance > 0)
-        worst, when = max((self.worst, self.when), (float(np.max(shares, initial=0.0)), k))
-        return CarriedRounding(rounding, worst, when)
+        largest_share = float(np.max(shares, initial=0.0))
+        if largest_share >= self.worst:
+            return CarriedRounding(rounding, worst=largest_share, when=k)
+        return CarriedRounding(rounding, self.worst, self.when)
 
 
 def find_noise_roots(matrices: Steps, size: Float[np.ndarray, " N"]) -> NoiseRoots:
     """Return roots of Cov(w) and Cov(v), with the rounding of a state y whose E[y_i^2] is `size` (N,) joined to them.
 
-    A measurement z = C y + c + v is rounded by its size, at most |C| sqrt(size).
+    Rounding counts as a further noise, so that no less is claimed than the computation gives. A measurement z = C y + c
+    + v is rounded by its size, at most |C| sqrt(size). `matrices` are those of a step, C, Cov(w) and Cov(v) among them.
     """
     received_size = (np.abs(matrices.output) @ np.sqrt(size)) ** 2
     return NoiseRoots(_root_with_rounding(matrices.process, size), _root_with_rounding(matrices.noise, received_size))
@@ -88,7 +97,8 @@ def _root_with_rounding(covariance: Float[np.ndarray, "n n"], seconds: Float[np.
 def step_covariance_roots(root: Float[np.ndarray, "N _"], matrices: Steps, noises: NoiseRoots) -> RecursionStep:
     """Return the gain G and roots of P- and P, given a root of P before: one step of Kalman's recursion.
 
-    P- = A P A' + Cov(w), O = C P- C' + Cov(v), G = P- C' O^-1, P = P- - G C P-. O may be singular (products of a
+    P- = A P A' + Cov(w), O = C P- C' + Cov(v), G = P- C' O^-1, P = P- - G C P-, with A and C of the step's `matrices`.
+    A root W of P is a matrix with W W' = P; by roots half as many digits are lost. O may be singular (products of a
     measurement with few values repeat): what repeats has the gain zero. `noises` are roots of Cov(w) and Cov(v).
     """
     predicted = np.concatenate([matrices.transition @ root, noises.process], axis=1)

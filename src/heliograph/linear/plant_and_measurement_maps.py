@@ -77,7 +77,8 @@ def _make_measurement_maps(
 ) -> list[AbstractRandomAffine]:
     """Return the random map from the state to what is received, z, at each step.
 
-    It is the sensor's map followed by the channel's. If the channel is a sum of links and the sensor's outputs have
+    `sensors` and `channels` are those of each step; noises are tabulated up to the `order` of their moments. The map
+    is is the sensor's map followed by the channel's. If the channel is a sum of links and the sensor's outputs have
     independent noises at all steps, the sensor is moved into each link instead (`move_sensor_into_links`). That gives
     one map of the state itself.
     """

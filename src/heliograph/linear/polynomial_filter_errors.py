@@ -305,7 +305,7 @@ def _largest_third_moment(
 def _index_products(variables: int) -> dict[tuple[int, ...], int]:
     """Return the positions of y_i, by (i,), and of y_i y_j, by (i, j), i <= j, among the monomials up to degree 2.
 
-    Monomials are those of degree 2 in (y, 1): y_i is y_i times 1.
+    y has so many `variables`. The monomials are those of degree 2 in (y, 1): y_i is y_i times 1.
     """
     index = {powers: i for i, powers in enumerate(list_exponents(variables + 1, 2))}
     unit = np.eye(variables + 1, dtype=int)

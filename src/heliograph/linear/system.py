@@ -119,7 +119,7 @@ class LinearSystem(Module):
 
 
 def repeat_last_step(first_steps: Sequence[np.ndarray], horizon: int) -> np.ndarray:
-    """Stack arrays of the first steps (time, ...), and repeat the last one for all later steps of the horizon."""
+    """Return arrays of the first steps stacked (horizon, ...), the last one repeated for all later steps."""
     values = np.array(first_steps)
     return np.concatenate([values, np.repeat(values[-1:], horizon - len(values), axis=0)])
 

@@ -110,7 +110,7 @@ def _predict_outputs(plant: AnyPlant, sensor: AnySensor, inputs: Float[Array, "h
     """
 
     def step(x: jax.Array, row: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        """Move the state's mean x over step k with inputs u; return it with the mean of the measurement there."""
+        """Return the state's mean after step k, to go on with, and the measurement's mean there; row: (k, inputs u)."""
         k, u = row
         plant_k, sensor_k = at(plant, k), at(sensor, k)
         x = plant_k.transition(x, u) + plant_k.noise_mean()

@@ -89,7 +89,7 @@ class ModalPlant(AbstractPlant, AbstractWithMemory):
     inputs: tuple[str, ...] = eqx.field(static=True)
 
     def __init__(self, memory: MarkovChain, models: Sequence[AbstractPlant], rates: "SwitchingRates | None" = None):
-        """Hold the chain and the plant of each mode; names and initial law are the first one's, as of all."""
+        """Hold the chain and the plant of each mode; names and law of x_0 are the first one's, as all have the same."""
         self.memory, self.rates = instance("memory", memory, MarkovChain, "a MarkovChain"), rates
         self.models = _read_mode_models("models of a plant", models, AbstractPlant)
         first_plant = self.models[0]
@@ -146,7 +146,7 @@ class _ChosenPlant(AbstractPlant):
     inputs: tuple[str, ...] = eqx.field(static=True)
 
     def __init__(self, models: tuple[AbstractPlant, ...], index: jax.Array):
-        """Hold all plants and the index of the chosen one; names and initial law are the first one's."""
+        """Hold all plants and the chosen one's index; names and law of x_0 are the first's, as all have the same."""
         self.models, self.index, self.noise = models, index, None
         first_plant = models[0]
         self.initial_mean, self.initial_covariance = first_plant.initial_mean, first_plant.initial_covariance

@@ -113,18 +113,20 @@ class ContinuousSystem(Module):
         """
 
         def add_term(k: Any, parts: tuple[Any, ...]) -> tuple[Any, ...]:
-            """Return the terms of order k of both series, and the sums with these terms.
+            """Return the terms of order k of both series, and the sums with these terms, from `parts`, those of k - 1.
 
             The first series is the integral of exp(A s) from 0 to h, with terms h^k A^(k-1) / k!. The second is the
-            integral of exp(A s) S exp(A s)'. `a` is A, and h the length of the step.
+            integral of exp(A s) S exp(A s)', with terms T_k = (h / k) (A T_k-1 + T_k-1 A').
             """
             integral_term, noise_term, integral, noise = parts
-            integral_term, half = a @ integral_term * (h / k), a @ noise_term * (h / k)
+            integral_term = a @ integral_term * (h / k)
+            half = a @ noise_term * (h / k)
             noise_term = half + half.T
             return integral_term, noise_term, integral + integral_term, noise + noise_term
 
-        power, spread = h * xp.eye(len(a)), h * xp.asarray(self.intensity)
-        parts = power, spread, power, spread
+        # The terms of order 1, h I and h S, which are the sums so far too.
+        first_integral_term, first_noise_term = h * xp.eye(len(a)), h * xp.asarray(self.intensity)
+        parts = first_integral_term, first_noise_term, first_integral_term, first_noise_term
         if is_traced(parts):
             parts = jax.lax.fori_loop(2, TERMS + 2, add_term, parts)
         else:

@@ -112,12 +112,12 @@ def join(plants: "Sequence[AbstractPlant]") -> LinearPlant | Plant:
 
 
 def _join_starts(parts: list[Any]) -> tuple[Any, Any]:
-    """Return initial mean and initial law of several plants' joint state, the arguments of the joint plant.
+    """Return initial mean and initial law of several plants' joint state, as arguments of the joint plant.
 
-    The joint state stacks the states of the plants. If all starts are known, x_0 = center + d: the joint law is that of
-    the independent deviations d of the plants, and the center is E[x_0] - E[d], since a law may have a mean of its own.
-    If the start of some states is unknown (a diffuse prior), the law is a `DiffuseStart`: the names of these states,
-    with the block-diagonal covariance of all others.
+    The joint state stacks the states of the plants, `parts`. If all starts are known, x_0 = center + d: the joint law
+    is that of the independent deviations d of the plants, and the center is E[x_0] - E[d], since a law may have a mean
+    of its own. If the start of some states is unknown (a diffuse prior), the law is a `DiffuseStart`: the names of
+    these states, with the block-diagonal covariance of all others.
 
     Raises:
         ValueError: some start is unknown, and another plant's law of x_0 is not Gaussian.

@@ -99,10 +99,11 @@ class _LimitedInverseHessian:
         self.updates: deque[tuple[np.ndarray, np.ndarray]] = deque(maxlen=memory)
 
     def times(self, vector: np.ndarray) -> np.ndarray:
-        """Return H v by two loops over the updates, newest first and then oldest first.
+        """Return H v of a `vector` v by two loops over the updates, newest first and then oldest first (L-BFGS).
 
-        `self.updates`: pairs (s, y) of a step and of the change of the gradient over it, the newest last.
-        H = V'H_before V + s s'/s'y with V = I - y s'/s'y, and H = I s'y/y'y (of the newest) before the oldest.
+        `self.updates`: pairs (s, y) of a step and of the change of the gradient over it, the newest last. An update
+        makes H = V'H_before V + s s'/s'y with V = I - y s'/s'y; before the oldest, H = I s'y/y'y with the newest
+        pair. The first loop applies the matrices V to v, the second V' and s s'/s'y. Without updates H = I.
         """
         v, weights = vector, []
         for s, y in reversed(self.updates):
@@ -130,9 +131,18 @@ def _backtrack(
 ) -> tuple[np.ndarray, float, np.ndarray] | None:
     """Shorten the step from x along `direction` until the value is finite and falls enough (Armijo's rule).
 
-    The value must fall by at least the share DECREASE of what the slope promises. `slope` is direction' gradient at x.
-    Else the length, 1 at first, is multiplied by SHORTEN. Returns the step, and value and gradient at its end; None if
-    no length from SHORTEST on will do.
+    The length is 1 at first, and is multiplied by SHORTEN until the value falls by at least the share DECREASE of what
+    the slope promises.
+
+    Args:
+        function: from x to its value and gradient.
+        x: where the step begins.
+        value: that of the function at x.
+        direction: of the step.
+        slope: direction' gradient at x.
+
+    Returns:
+        The step, and value and gradient at its end; None if no length from SHORTEST on will do.
     """
     length = 1.0
     while length >= SHORTEST:

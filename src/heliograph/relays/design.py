@@ -226,9 +226,10 @@ def _check_start(network: RelayNetwork, design: RelayDesign) -> None:
 
 @compile_in_float64
 def _predict_covariances(steps: RelaySteps, moments: Float[Array, "time d d"]) -> Float[Array, "time z z"]:
-    """Return at each step the covariance of state, errors of all F filters before corrections, and R innovations.
+    """Return at each step the covariance of (x, e_1 .. e_F before corrections, the R innovations), of size z = d + R.
 
-    `moments` (d, d): of the state and the errors before the step; the result has size z = d + R.
+    x is the state and e_f the error of filter f. `moments` are the covariances (d, d) of (x, e_1 .. e_F) before each of
+    the network's `steps`.
     """
     return jax.vmap(lambda step, covariance: step_moments(step, covariance)[0])(steps, moments)
 
@@ -236,7 +237,8 @@ def _predict_covariances(steps: RelaySteps, moments: Float[Array, "time d d"]) -
 def make_receiver_cost(weights: Float[np.ndarray, "steps"], filters: int, n: int) -> Float[np.ndarray, "steps d d"]:
     """Return the matrices C_k of the cost, <C_k, moments_k> = weight_k tr P_k, P_k the receiver's error covariance.
 
-    <A, B> is the sum of A_ij B_ij. The moments are of (x, e_1 .. e_F), each of n entries; the receiver's error is last.
+    <A, B> is the sum of A_ij B_ij. The moments are of (x, e_1 .. e_F) with F = `filters`, each of n entries; the
+    receiver's error is last. `weights` are weight_k of each step.
     """
     d = (1 + filters) * n
     matrices = np.zeros((len(weights), d, d))

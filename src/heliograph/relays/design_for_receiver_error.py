@@ -92,7 +92,7 @@ def _sweep_backward(
     """
 
     def predict(moments: jax.Array, row: tuple[RelaySteps, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        """Return the moments after a step with its given gain, and those before the correction."""
+        """Return the moments after a step, to go on with, and before its correction; row: the step and its gain."""
         step, gain = row
         uncorrected, _ = step_moments(step, moments)
         return correct_moments(uncorrected, gain), uncorrected

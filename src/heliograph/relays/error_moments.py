@@ -47,8 +47,9 @@ def make_error_step_maps(step: RelaySteps) -> ErrorStepMaps:
     x is the plant's state, e_f = x - s_f the error of filter f (relays first, the receiver last), w the process noise
     and v the sensor's. Each filter has some of the R received numbers: `step.owner` is the filter of each.
     """
-    (m, n), filters = step.sensing.shape, len(step.received)
-    d = (1 + filters) * n
+    m, n = step.sensing.shape
+    filters = len(step.received)
+    d = (1 + filters) * n  # numbers in (x, e_1 .. e_F)
     # Rows that select x, e_1 .. e_F, and the noises w and v.
     unit = jnp.eye(d + n + m)
     state, w, v = unit[:d].reshape(1 + filters, n, -1), unit[d : d + n], unit[d + n :]
@@ -210,7 +211,8 @@ def propagate_error_moments(
     def move(moments: jax.Array, row: tuple[RelaySteps, jax.Array | None]) -> tuple[jax.Array, tuple[jax.Array, ...]]:
         """Return the covariance of eta after a step, and the triple (gains, this covariance, powers) to collect.
 
-        Where `gain` is None, each filter gets the gain that minimises its own error at this step.
+        `moments` is the covariance before the step; a row has the step and its gains. Where these are None, each filter
+        gets the gain that minimises its own error at this step.
         """
         step, gain = row
         uncorrected, sent = step_moments(step, moments)  # uncorrected: of (eta+ before corrections, innovations)

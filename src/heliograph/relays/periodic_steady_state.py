@@ -160,15 +160,15 @@ def is_covariance(moments: Float[Array, "... d d"]) -> Bool[jax.Array, ""]:
 def steady_receiver_covariance(steps: RelaySteps, gains: Float[Array, "slots Fn R"]) -> Float[jax.Array, "slots d d"]:
     """Return the steady error covariances of the best linear estimate of (x, e_relays) from the receiver's data.
 
-    They are those at the end of each slot of a period. The receiver's gains are held while differentiating: they
-    minimise the error, so their change has no first-order effect, and the fixed point with given gains is affine.
+    In each slot the receiver observes zeta+ = A zeta + noise, z = C zeta + noise with zeta = (x, e_relays) (d,). The
+    result has the covariances of zeta - its estimate at the end of each slot of a period. The receiver's gains are held
+    while differentiating: they minimise the error, so their change has no first-order effect, and the fixed point with
+    given gains is affine.
 
     Args:
         steps: of one period.
         gains: of all filters as one block matrix for each slot; those of the receiver are not used.
     """
-    # In each slot the receiver observes zeta+ = A zeta + noise, z = C zeta + noise, zeta = (x, e_relays) of size d. The
-    # covariances below are of its error, zeta - estimate.
     moments = steady_moments(steps, gains).moments[:-1]
     views = jax.vmap(make_receiver_view)(steps, moments, gains)
     d = views.transition.shape[-1]
@@ -218,7 +218,9 @@ _steady_behind = compile_in_float64(steady_receiver_covariance)
 def _period_operator(steps: RelaySteps, gains: Float[Array, "slots Fn R"]) -> Float[jax.Array, "e e"]:
     """Return the linear part of the map of second moments over one period, a matrix on the entries of a triangle.
 
-    The map is affine, so it may be linearised anywhere, here at 0. Its spectral radius says whether moments converge.
+    The moments are Cov(x, e_1 .. e_F), of the state and all filters' errors; a symmetric matrix is given by the e
+    entries of its upper triangle. The map is affine, so it may be linearised anywhere, here at 0. Its spectral radius
+    says whether moments converge under these `gains`, one block matrix for each of the period's `steps`.
     """
     d = gains.shape[1] + steps.transition.shape[-1]
     _, linear = jax.linearize(lambda m: propagate_error_moments(steps, m, gains).moments[-1], jnp.zeros((d, d)))
@@ -267,7 +269,7 @@ def _repeat_until_steady(
         return value_after, change, count + 1
 
     def changes(carry: RepeatedPeriods) -> jax.Array:
-        """Return whether the last change is above the tolerance, and periods are left."""
+        """Return whether to repeat once more: the last change is above the tolerance, and periods are left."""
         _, change, count = carry
         return (change > tolerance) & (count < PERIODS)
 
@@ -338,10 +340,17 @@ def _tune_gains(
     cost: Cost,
     power_limit: ArrayLike | None,
 ) -> Float[np.ndarray, "slots Fn R"]:
-    """Return the gains of least cost near `start`, which must have one block matrix for each slot.
+    """Return the gains of least cost that a descent from `start` finds, for the periodic steady state.
 
-    `free` is True for the received numbers whose gains may change. `cost` computes the cost of gains, with the penalty
-    of power.
+    Args:
+        network: the relay network, which varies with its slots only.
+        start: gains of all filters, one block matrix for each slot.
+        free: True for the received numbers whose gains may change.
+        cost: the cost of gains, with a penalty of power.
+        power_limit: of all relays together in each slot; None for no limit.
+
+    Raises:
+        ValueError: what `periodic_steps` and `minimise_over_gains` refuse, another number of gains than slots.
     """
     steps = periodic_steps(network)
     check_gains_of_slots(network, start)

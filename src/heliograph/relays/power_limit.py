@@ -57,7 +57,13 @@ class PowerLimitedProblem(NamedTuple):
 def make_power_limit(steps: RelaySteps, value: ArrayLike, d: int) -> PowerLimit:
     """Return a limit `value` on the power of all relays together at each step as one on Cov(x, e_1 .. e_F) (d, d).
 
-    <form_k, covariance after step k> <= limit_k limits what relays send at step k + 1.
+    <form_k, covariance after step k> <= limit_k limits what relays send at step k + 1, as they send estimates of the
+    step before.
+
+    Args:
+        steps: the network's steps.
+        value: the limit, a number or one for each step.
+        d: length of (x, e_1 .. e_F), the state and all filters' errors.
 
     Raises:
         ValueError: a limit below what the mean state takes.
@@ -83,7 +89,8 @@ def make_power_limit(steps: RelaySteps, value: ArrayLike, d: int) -> PowerLimit:
 def make_power_matrices(steps: RelaySteps, d: int) -> Float[np.ndarray, "time {d} {d}"]:
     """Return form_k: <form_k, moments before step k> is the sum over the transmitting relays of tr Cov(C s_r).
 
-    <A, B> = tr A' B. Relay r sends C s_r of its estimate s_r. `d` is the size of the moments.
+    <A, B> = tr A' B. Relay r sends C s_r of its estimate s_r = x - e_r, at those of the network's `steps` at which it
+    transmits. The moments are Cov(x, e_1 .. e_F) (d, d), of the state and all filters' errors.
     """
     time, n = steps.state_mean.shape
     forms = np.zeros((time, d, d))
@@ -119,8 +126,9 @@ def minimise_within_limit(
         units = np.asarray(_choose_step_units(problem, gains, barrier))
         evaluate = partial(_evaluate_barrier, problem, gains, units, barrier)
         shape = units.shape[:2]
-        x0, steps_of_descent = np.zeros(math.prod(shape)), -(-iterations // len(BARRIERS))
-        x = bfgs(evaluate, start=x0, iterations=steps_of_descent, tolerance=PRECISION, memory=MEMORY)
+        steps_of_descent = math.ceil(iterations / len(BARRIERS))
+        no_change = np.zeros(math.prod(shape))
+        x = bfgs(evaluate, start=no_change, iterations=steps_of_descent, tolerance=PRECISION, memory=MEMORY)
         designs.append(np.asarray(_change_gains(gains, units, x.reshape(shape), problem.steps)))
     # The cheapest that meets all limits, without those at which a descent overflowed.
     judged = [_compute_cost_and_slack(problem, gains) for gains in designs]
@@ -162,7 +170,7 @@ def _scale_into_limit(
 def _compute_cost_and_slack(
     problem: PowerLimitedProblem, gains: Float[Array, "time Fn R"]
 ) -> tuple[Float[Array, ""], Float[Array, "time"]]:
-    """Return the cost of given gains, and the share of each step's power limit that they leave free.
+    """Return the cost of given gains in a `problem`, and the share of each step's power limit that they leave free.
 
     With <A, B> = sum of A_ij B_ij: the cost is sum_k <cost_k, moments after step k>, and the power <form_k, the same>.
     """
@@ -177,7 +185,8 @@ def _change_gains(
 ) -> Float[Array, "time Fn R"]:
     """Return the gains with their r free entries changed by units_k x_k at each step k; x is (time, r).
 
-    An entry is free if it multiplies what its filter receives (`gain_mask`). All other entries are always zero.
+    An entry is free if it multiplies what its filter receives itself (`gain_mask`, the same at all `steps`). All other
+    entries are always zero. Column j of units_k is the change of the free entries for one unit of x_kj.
     """
     rows, columns = np.nonzero(gain_mask(steps))
     return jnp.asarray(gains).at[:, rows, columns].add(jnp.einsum("kij,kj->ki", units, x))

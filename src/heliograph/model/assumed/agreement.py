@@ -76,16 +76,24 @@ def _enlarge_world_by_past(believed: AssumedModel, own: AssumedModel) -> Assumed
 
 
 def join_assumed(assumed_models: Sequence[AssumedModel]) -> AssumedModel:
-    """Return what a filter assumes (its assumed model) that receives the measurements of several filters of one plant.
+    """Return the models that a fusion filter is made for which receives the measurements of several filters of a plant.
 
-    Sensors and channels are stacked. The first trigger, encoder or range of values among them stands for all.
+    Their sensors and channels are stacked. The first trigger, encoder or range of values among them stands for all; a
+    schedule (`Periodic`) is none of these, as silence by schedule says nothing of the state.
+
+    Args:
+        assumed_models: of each filter, the models that it is made for; all have the same plant.
     """
     if len(assumed_models) == 1:
         return assumed_models[0]
     sensors = [assumed.sensor for assumed in assumed_models if assumed.sensor is not None]
     channels = [assumed.channel for assumed in assumed_models if assumed.channel is not None]
     sensor, channel = join_links({str(i): s for i, s in enumerate(sensors)}, channels)
-    triggers = [p.trigger for p in assumed_models if p.trigger is not None and not isinstance(p.trigger, Periodic)]
+    triggers = [
+        assumed.trigger
+        for assumed in assumed_models
+        if assumed.trigger is not None and not isinstance(assumed.trigger, Periodic)
+    ]
     encoders = [assumed.encoder for assumed in assumed_models if assumed.encoder is not None]
     ranges = [assumed.range for assumed in assumed_models if assumed.range is not None]
     return assumed_models[0].replaced(

@@ -61,13 +61,16 @@ class AssumedModel:
     ):
         """Hold the models for which a filter is made, and on which its claim (exact, upper or nominal) depends.
 
-        `order`: highest order of moments of noises and gains that the filter uses, None for their whole laws. `relays`
-        with their `gains` by name stand for sensor and channel. `range`: limits beyond which the receiver refuses a
-        number. `encoder`: rounds what is sent to codewords.
+        `trigger`: the rule by which the sender sends or is silent. `order`: highest order of moments of noises and
+        gains that the filter uses, None for their whole laws. `relays` with their `gains` by name stand for sensor and
+        channel. `range`: limits beyond which the receiver refuses a number. `encoder`: rounds what is sent to
+        codewords.
         """
-        self.plant, self.sensor, self.channel, self.trigger, self.order = plant, sensor, channel, trigger, order
-        self.relays, self.gains, self.range = relays, {} if gains is None else dict(gains), range
-        self.encoder = encoder
+        self.plant, self.sensor, self.channel = plant, sensor, channel
+        self.trigger, self.order = trigger, order
+        self.relays = relays
+        self.gains = {} if gains is None else dict(gains)
+        self.range, self.encoder = range, encoder
 
     def replaced(self, **parts: Any) -> "AssumedModel":
         """Return the models that a filter was made for with some of them replaced, such as plant=..."""

@@ -73,7 +73,11 @@ def _same_map(a: AbstractRandomAffine, b: AbstractRandomAffine, order: int | Non
 
 
 def _same_given_arrival(a: AbstractRandomAffine, b: AbstractRandomAffine) -> bool:
-    """Return whether two maps are the same except for what they lose; False if losses depend on gains."""
+    """Return whether two maps are the same map of what arrives, though they may lose messages in other ways.
+
+    A filter sees what is lost, so it need not know the law of losses. False where losses depend on the gains, since a
+    loss then tells of the gain.
+    """
     try:
         return are_same(a.condition_on_arrival(), b.condition_on_arrival())
     except ValueError:  # losses depend on gains
@@ -143,9 +147,10 @@ def _moments_agree(a: Moments, b: Moments, arrived: np.ndarray) -> bool:
 def same_observation(
     a: tuple[AbstractSensor, AbstractRandomAffine], b: tuple[AbstractSensor, AbstractRandomAffine], order: int | None
 ) -> bool:
-    """Return whether two pairs of sensor and channel are one map from the state, though written differently.
+    """Return whether two pairs (sensor, channel), a and b, are one map from the state, though written differently.
 
-    This is only decided for filters that use mean and covariance (`order`).
+    An example is a factor that stands in the sensor's matrix or in the channel's gain. Moments of the maps are
+    compared, so that this is only decided for filters that use mean and covariance (`order`); else it is False.
     """
     if order != MEAN_AND_COVARIANCE or is_traced(a, b):
         return False

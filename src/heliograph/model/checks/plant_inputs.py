@@ -253,13 +253,19 @@ def _evaluate_in_blocks_of_steps(
 def _evaluate_at_steps(
     plant: AnyPlant | AnySensor, functions: tuple[ModelMatrixFunction, ...], u: Array, steps: Array
 ) -> Any:
-    """Return the matrices of each function at each step (steps, n, m), under the inputs u of that step.
+    """Return for each function its matrices at all steps (steps, n, m), under the inputs u of each step.
 
     It is compiled, since computing one operation after another is slow.
+
+    Args:
+        plant: plant or sensor, constant or over time.
+        functions: each from (the model of a step, its inputs) to a matrix.
+        u: inputs of each step (steps, inputs).
+        steps: number of each step (steps,).
     """
 
     def of_step(k: jax.Array, u_k: jax.Array) -> tuple[jax.Array, ...]:
-        """Return what the functions return at step k."""
+        """Return the matrix of each function at step k, whose inputs are u_k."""
         now = at(plant, k)
         return tuple(function(now, u_k) for function in functions)
 

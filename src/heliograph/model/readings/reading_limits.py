@@ -157,9 +157,12 @@ class ReadingLimits(Module):
         return np.asarray(self.find_refusal_reasons(z) > 0)
 
     def describe_missing(self, z: Float[np.ndarray, " m"], refused: Int[np.ndarray, " m"], names: Sequence[str]) -> str:
-        """Return in words which components of a measurement are refused, or "" if none is.
+        """Return in words which components of a measurement are refused, and why, or "" if none is.
 
-        `refused`: the number of each component's reason, as `screen` returns it.
+        Args:
+            z: the measurement, with the readings that are refused.
+            refused: the number of each component's reason, 0 if it is kept, as `screen` returns it.
+            names: names of the components.
         """
         descriptions = []
         for i in np.flatnonzero(refused).tolist():
@@ -175,11 +178,12 @@ class ReadingLimits(Module):
 
 
 def equals_code(z: ArrayLike, codes: Float[np.ndarray, " codes"]) -> Bool[np.ndarray, "..."]:
-    """Return whether each number is a code, a number such as -999 that stands for no reading.
+    """Return whether each number of z (...) is one of some codes, numbers such as -999 that stand for no reading.
 
-    Numbers count as equal up to the rounding of a product, and if single precision stores the code so.
+    A number counts as the code if it differs by the rounding of a product, as where a device scales whole numbers, or
+    if it is the code as single precision stores it.
     """
-    numbers = np.asarray(z, dtype=np.float64)[..., None]
+    numbers = np.asarray(z, dtype=np.float64)[..., None]  # compared with all codes along a last axis
     if not len(codes):
         return np.zeros(numbers.shape[:-1], dtype=bool)
     # ROUNDING, SINGLE: relative rounding of a product of doubles, and of a number in single precision. All but the

@@ -185,7 +185,11 @@ def _rewrite_selection(link: GainAndNoise, components: Components, form: WordFor
 def _rewrite_series(link: Series, components: Components, form: WordForm) -> RewrittenMap:
     """Return maps in series as maps of the numbers of their codewords, and the components that the last one delivers.
 
-    `components` are those that the first map gets. Each map gets the components that the previous one delivers.
+    Args:
+        link: the maps in series.
+        components: for each codeword at the input of the first map, the index in y of its component. Each further map
+            gets the components that the map before it delivers.
+        form: how a codeword is written as numbers.
     """
     maps = []
     for inner in link.maps:
@@ -198,8 +202,11 @@ def _rewrite_series(link: Series, components: Components, form: WordForm) -> Rew
 def _rewrite_choice(link: AbstractOneOfSeveralMaps, components: Components, form: WordForm) -> RewrittenMap:
     """Return a choice among maps as a choice among maps of the numbers of their codewords, and its components.
 
-    All maps get the same `components`. All must deliver the same, since the receiver does not see which was chosen:
-    otherwise ValueError is raised.
+    All maps get the same `components`: for each codeword at their input, the index in y of its component. `form` says
+    how a codeword is written as numbers.
+
+    Raises:
+        ValueError: maps that deliver other components, since the receiver does not see which map was chosen.
     """
     choices = [_rewrite_map(inner, components, form) for inner in link.maps]
     if len({choice.components for choice in choices}) > 1:
