@@ -79,8 +79,9 @@ def check_time_step(names: Sequence[str], u: Float[np.ndarray, "... inputs"]) ->
 def _is_time_step(dt: Array, precision: type = np.float64) -> Array:
     """Return whether each number can be a time step: from 0 to LONGEST (2^53), and not from a counter that wrapped.
 
-    A negative difference of unsigned 32-bit counters reads as just below 2^32. That means within NEAR for whole
-    numbers, or within CLOSE if dt has SMALLER = 1e3 or 1e6 counts in a unit. `precision`: type of the numbers.
+    A clock that counts in unsigned numbers of 32 bits and goes back by d gives the difference 2^32 - d. So numbers just
+    below 2^32 are refused: whole ones, counts themselves, within NEAR of it; those that are thousandths or millionths
+    of a unit (SMALLER: counts in a unit), within CLOSE counts. `precision`: type of the numbers.
     """
     has_wrapped = _is_near_wrap(dt, 1.0, NEAR, precision) & (dt.round() == dt)
     for counts_in_unit in SMALLER:
@@ -197,13 +198,13 @@ def _sensor_matrix(sensor: LinearSensor, u: jax.Array) -> jax.Array:
 
 
 def _sensor_noise(sensor: AbstractSensor, u: jax.Array) -> jax.Array:
-    """Return the noise's covariance of a sensor of inputs, under its inputs u."""
+    """Return the covariance R(u) of the noise of a sensor whose noise is a function of its inputs u."""
     assert isinstance(sensor.noise, NoiseOfInputs)
     return sensor.noise.given(u)
 
 
 def _input_matrix(plant: AbstractPlant, u: jax.Array) -> jax.Array:
-    """Return B of a linear plant under the inputs u."""
+    """Return the input matrix B(u) of a linear plant."""
     assert isinstance(plant, LinearPlant)
     return matrix_under_inputs(plant.input_matrix, u)
 
@@ -216,13 +217,16 @@ def _check_functions_of_inputs(
     COVARIANCES: names of the matrices that must be covariances. `steps`: the step of each row.
     """
     functions = _list_functions_of_inputs(first(plant))
-    blocks = list(_evaluate_in_blocks_of_steps(plant, tuple(functions.values()), u, steps)) if functions else []
-    for name, matrices in zip(functions, map(np.concatenate, zip(*blocks, strict=True)), strict=True):
+    if not functions or not len(u):
+        return
+    blocks = _evaluate_in_blocks_of_steps(plant, tuple(functions.values()), u, steps)
+    for name, matrices_by_block in zip(functions, zip(*blocks, strict=True), strict=True):
+        matrices = np.concatenate(matrices_by_block)  # of the function, at all steps
         is_covariance = name in COVARIANCES
         wrong = mask_invalid_covariances(matrices) if is_covariance else ~np.isfinite(matrices).all(axis=(1, 2))
         if wrong.any():
             row = int(np.argmax(wrong))
-            inputs = ", ".join(f"{name} = {x:.6g}" for name, x in zip(first(plant).inputs, u[row], strict=True))
+            inputs = ", ".join(f"{key} = {x:.6g}" for key, x in zip(first(plant).inputs, u[row], strict=True))
             where = f"row {row + 1}" if len(u) > 1 else f"step {steps[0]}"
             got = f"{_shorten(matrices[row])} in {where}, for {inputs}"
             raise fail(name, "a covariance" if is_covariance else "finite numbers", got)
@@ -273,7 +277,7 @@ def _evaluate_at_steps(
 
 
 def _shorten(value: np.ndarray) -> str:
-    """Return a matrix as text of at most MOST_SHOWN characters."""
+    """Return a matrix as text for an error message, cut to MOST_SHOWN characters."""
     shown = str(np.round(value, 12).tolist())
     return shown if len(shown) <= MOST_SHOWN else shown[: MOST_SHOWN - 3] + "..."
 
