@@ -256,8 +256,10 @@ def _raise_interval_to_power(a: Interval, exponent: int) -> Interval:
 
 def _bound_absolute(a: Interval) -> Interval:
     """Return the interval of |x|, from 0 where x may be 0."""
-    least, largest = np.minimum(np.abs(a.low), np.abs(a.high)), np.maximum(np.abs(a.low), np.abs(a.high))
-    return Interval(np.where((a.low <= 0) & (a.high >= 0), 0.0, least), largest)
+    sizes_of_ends = np.abs(a.low), np.abs(a.high)
+    least, largest = np.minimum(*sizes_of_ends), np.maximum(*sizes_of_ends)
+    holds_zero = (a.low <= 0) & (a.high >= 0)
+    return Interval(np.where(holds_zero, 0.0, least), largest)
 
 
 def _make_monotone_bound(

@@ -79,9 +79,13 @@ class GrowthFinding(NamedTuple):
 
     @property
     def refuted(self) -> bool:
-        """True if a pair, a slope or f(0) breaks the constant."""
-        steep = self.differences and not self.slope <= self.limit
-        return steep or not self.ratio <= self.limit or not self.starts_at_zero
+        """True if evidence breaks the constant a: a pair, a slope, or an f(0) other than 0.
+
+        A slope counts where a is to bound differences of f; |f(x)| <= a |x| alone allows steep slopes.
+        """
+        is_too_steep = self.differences and not self.slope <= self.limit  # NaN counts as too steep
+        has_too_large_ratio = not self.ratio <= self.limit
+        return is_too_steep or has_too_large_ratio or not self.starts_at_zero
 
     @property
     def proved(self) -> bool:
@@ -195,7 +199,7 @@ class _LipschitzMeter:
         self.values = _compile_by_part(jax.vmap(lambda x: jnp.atleast_1d(function(x))))
 
     def measure_slopes(self, points: Float[np.ndarray, "count n"]) -> Float[np.ndarray, "count"]:
-        """Return the norm of the Jacobian at each point, and infinity where the Jacobian is not finite."""
+        """Return the spectral norm of the Jacobian at each point, infinite where the Jacobian is not finite."""
         values = np.asarray(self.jacobian(points))
         is_finite = np.isfinite(values).all(axis=(-2, -1))
         finite_values = np.where(is_finite[:, None, None], values, 0.0)
@@ -262,7 +266,7 @@ def _compile_by_part(function: Callable[[Any], jax.Array]) -> Callable[[np.ndarr
     compute = compile_in_float64(function)
 
     def call(points: np.ndarray) -> np.ndarray:
-        """Compute the points in parts of `size`; copies of the last point fill up the last part."""
+        """Return the function at points (count, n), in parts of `size`; copies of the last point fill the last part."""
         size = CLIMBERS * TRIALS
         padded = np.concatenate([points, np.repeat(points[-1:], -len(points) % size, axis=0)])
         values = [compute(padded[start : start + size]) for start in range(0, len(padded), size)]

@@ -83,9 +83,9 @@ def complete_multipliers(
     With `separate` the result is (steps, 4) for f, f~, h, h~. Otherwise (f, f~) share one, and (h, h~) too: (steps, 2).
     """
     multipliers_by_function = 2 if separate else 1
-    is_present = [
-        not growth.absent for growth in (system.growth, system.output_growth) for _ in range(multipliers_by_function)
-    ]
+    is_present = list[bool]()
+    for growth in (system.growth, system.output_growth):
+        is_present += [not growth.absent] * multipliers_by_function
     multipliers = np.zeros((*found.shape[:-1], len(is_present)))
     multipliers[..., is_present] = found
     return multipliers

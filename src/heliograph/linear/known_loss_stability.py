@@ -256,11 +256,12 @@ def find_fastest_unobserved_mode(
     E P >= eps P(the links stay in the set for l steps) |a|^(2 l) v v'. This grows by |a|^2 times the spectral radius of
     the chain within the set. If every mode observes every eigenvector, the growth is 0.
     """
-    results = [
-        UnobservedGrowth(abs(value) ** 2 * spectral_radius(chain[np.ix_(modes, modes)]), value, modes, vectors)
-        for value, space in list_eigenspaces(matrix)
-        for modes, vectors in _find_unobserving_modes(space, outputs)
-    ]
+    results = list[UnobservedGrowth]()
+    for eigenvalue, space in list_eigenspaces(matrix):
+        for modes, vectors in _find_unobserving_modes(space, outputs):
+            chain_within = chain[np.ix_(modes, modes)]
+            growth = abs(eigenvalue) ** 2 * spectral_radius(chain_within)
+            results.append(UnobservedGrowth(growth, eigenvalue, modes, vectors))
     no_growth = UnobservedGrowth(0.0, 0j, (), np.zeros((len(matrix), 0)))
     return max(results, key=lambda found: found.growth, default=no_growth)
 
@@ -312,8 +313,10 @@ def is_excited_by_noise(vectors: np.ndarray, matrix: Float[np.ndarray, "n n"], n
     It does if they lie in the controllable subspace, which is spanned by W, A W, A^2 W, ... with A the `matrix` and W
     the covariance of the noise.
     """
-    basis, columns = np.zeros((len(matrix), 0)), noise
+    basis = np.zeros((len(matrix), 0))  # orthonormal, of the subspace so far
+    columns = noise
     for _ in range(len(matrix)):
+        # The basis with the next columns, which are scaled to the size 1 of the basis vectors.
         size = np.linalg.norm(columns, 2) if columns.size else 0.0
         if size == 0:
             break

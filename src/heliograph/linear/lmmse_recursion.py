@@ -90,7 +90,7 @@ def _root_with_rounding(covariance: Float[np.ndarray, "n n"], seconds: Float[np.
 
     `seconds` are the second moments (n,) of the numbers to which the noise is added, since the sums are rounded.
     """
-    rounding = rounding_of(seconds + np.maximum(np.diag(covariance), 0.0))
+    rounding = rounding_of(seconds + np.maximum(np.diag(covariance), 0.0))  # matrix diag(weights) matrix'
     return np.concatenate([roots_of(covariance), rounding.matrix * np.sqrt(rounding.weights)], axis=1)
 
 

@@ -1,6 +1,7 @@
 """A linear model lifted to monomials: powers of the state and of the measurement, and modes, as one linear system."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -212,15 +213,14 @@ def lifted_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: 
     second = products_of_monomials(moments, n + 1, degree)
     mean, covariance = mean_and_covariance(second)
     measurement_varies = isinstance(sensor, OverTime) or isinstance(channel, OverTime)
-    varies = isinstance(plant, OverTime), measurement_varies
-    steps, process_rounding, received_rounding = _lift_steps(routes, degree, moments, varies)
+    lifted = _lift_steps(routes, degree, moments, isinstance(plant, OverTime), measurement_varies)
     system = LinearSystem(
-        steps,
+        lifted.steps,
         mean=mean,
         covariance=covariance,
         projection=make_linear_rows(n, degree),
-        rounding=process_rounding,
-        received_rounding=received_rounding,
+        rounding=lifted.process_rounding,
+        received_rounding=lifted.received_rounding,
         start_rounding=EPS * np.diag(second)[:-1],
     )
     return with_assumed(system, assumed)
@@ -244,22 +244,37 @@ def _lift_chain(
     return lift_modes([r.plant for r in routes], modes_by_step, degree, moments, projection)
 
 
+class _LiftedSteps(NamedTuple):
+    """Steps of a system of monomials, and the rounding errors of its noises' variances over time.
+
+    process_rounding: of Cov(w), (time, monomials of x). received_rounding: of Cov(v), (time, monomials of z).
+    """
+
+    steps: Steps
+    process_rounding: Float[np.ndarray, "time N"]
+    received_rounding: Float[np.ndarray, "time m"]
+
+
 def _lift_steps(
-    routes: Sequence[PlantAndMeasurementMaps], degree: int, moments: Float[np.ndarray, "M"], varies: tuple[bool, bool]
-) -> tuple[Steps, np.ndarray, np.ndarray]:
+    routes: Sequence[PlantAndMeasurementMaps],
+    degree: int,
+    moments: Float[np.ndarray, "M"],
+    plant_varies: bool,
+    measurement_varies: bool,
+) -> _LiftedSteps:
     """Lift each step to monomials; return the steps, and the rounding errors of both noises' variances over time.
 
     The lifted state has all monomials of x up to the degree: X+ = F X + f + w, Z = H X+ + h + v. The covariances of its
     noises depend on the moments of x before any data, so these are followed too. Once they are steady, all later steps
-    equal the last, to rounding. The roundings are (time, monomials of x) and (time, monomials of z).
+    equal the last, to rounding.
 
     Args:
         routes: the maps of each step, x -> x+ and x+ -> z.
         degree: largest degree of the monomials.
         moments: moments of x_0 up to twice the degree (M,).
-        varies: whether the plant differs between steps, and whether the measurement does.
+        plant_varies: whether the plant differs between steps.
+        measurement_varies: whether the sensor or the channel does.
     """
-    plant_varies, measurement_varies = varies
     steps, roundings = list[Steps](), list[tuple[np.ndarray, np.ndarray]]()
     steady = SteadyMomentTest(np.asarray(routes[0].plant.matrix), 2 * degree, plant_varies or measurement_varies)
     last: PlantAndMeasurementMaps | None = None
@@ -283,7 +298,7 @@ def _lift_steps(
         roundings.append((rounding_of_process, rounding_of_noise))
     over_time = Steps(*(repeat_last_step(values, len(routes)) for values in zip(*steps, strict=True)))
     process_rounding, received_rounding = (repeat_last_step(x, len(routes)) for x in zip(*roundings, strict=True))
-    return over_time, process_rounding, received_rounding
+    return _LiftedSteps(over_time, process_rounding, received_rounding)
 
 
 def _are_identical(left: AbstractRandomAffine, right: AbstractRandomAffine) -> bool:

@@ -118,7 +118,7 @@ class _MomentCache:
     """
 
     def __init__(self) -> None:
-        """Start without kept moments: none of a plant's noise, and none of a measurement."""
+        """Begin with an empty cache: no table of a plant's noise, and no moments of a measurement."""
         self.last_plant_noise: AbstractNoise | None = None
         self.joint_noise: AbstractNoise | None = None
         self.last_measurement: AbstractRandomAffine | None = None
@@ -163,11 +163,13 @@ def _make_received_products(n: int, m: int) -> np.ndarray:
     total = 2 * n + m
     index_of_monomial = {powers: i for i, powers in enumerate(list_exponents(total + 1, 2))}
     # z and z z': exponents of (z, 1) behind zeros for x and q; the last one, of the constant alone, is left out.
-    selected = [(*(0,) * (2 * n), *powers) for powers in list_exponents(m + 1, 2)[:-1]]
+    no_x_and_q = (0,) * (2 * n)
+    selected = [(*no_x_and_q, *powers) for powers in list_exponents(m + 1, 2)[:-1]]
     # z_i q_j: exponent 1 of q_j, variable n + j, and of z_i, variable 2 n + i.
     for i in range(m):
         for j in range(n):
-            selected.append(tuple(int(variable in (n + j, 2 * n + i)) for variable in range(total + 1)))
+            factors = n + j, 2 * n + i
+            selected.append(tuple(int(variable in factors) for variable in range(total + 1)))
     rows = np.zeros((len(selected), len(index_of_monomial) - 1))
     for row, powers in zip(rows, selected, strict=True):
         row[index_of_monomial[powers]] = 1.0
@@ -196,8 +198,13 @@ class GainOverLinear:
 
     def gain(self, degree: int) -> Float[np.ndarray, "n"]:
         """Return the share of the linear filter's error variance that this degree removes, for each state."""
-        mean = {d: np.diagonal(self.covariance[d][self.after :], axis1=1, axis2=2).mean(axis=0) for d in (1, degree)}
-        return np.asarray(1 - mean[degree] / mean[1])
+
+        def average_variances(d: int) -> np.ndarray:
+            """Return the error variance of each state by the filter of degree d, averaged over the steps that count."""
+            variances = np.diagonal(self.covariance[d][self.after :], axis1=1, axis2=2)
+            return np.asarray(variances.mean(axis=0))
+
+        return np.asarray(1 - average_variances(degree) / average_variances(1))
 
     @property
     def symmetric(self) -> bool:

@@ -114,7 +114,7 @@ def told(
 
 
 def _check_law(law: object) -> AbstractLaw | AbstractNoise | None:
-    """Return a law of reported numbers, or None, as it is; raise ValueError for anything else."""
+    """Return the law of the numbers that messages report, None for none; raise ValueError for anything else."""
     if law is None or isinstance(law, AbstractLaw | AbstractNoise):
         return law
     raise fail("law of the numbers told", "a noise law, a law of gains, or a MarkovChain", show_value(law))

@@ -85,6 +85,7 @@ def markov_fading(
     if isinstance(transition, MarkovChain) and name is not None:
         raise fail("name", "none beside a chain, which has its own", repr(name))
     chain = transition if isinstance(transition, MarkovChain) else MarkovChain(transition, name=name)
+    # Gains are channels, or else numbers.
     channels = [gain for gain in gains if isinstance(gain, AbstractRandomAffine)] if isinstance(gains, Sequence) else []
     if channels:
         if noise is not None:
@@ -92,7 +93,8 @@ def markov_fading(
         return Modes(chain, channels)
     if noise is None:
         raise fail("noise", "one for gains that are numbers", "none")
-    return Modes(chain, [hop(g, noise) for g in array("gains of the modes", cast(ArrayLike, gains), (None,))])
+    numbers = array("gains of the modes", cast(ArrayLike, gains), (None,))
+    return Modes(chain, [hop(gain, noise) for gain in numbers])
 
 
 def autoregressive_fading(

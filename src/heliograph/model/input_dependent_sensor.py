@@ -47,7 +47,7 @@ class NoiseOfInputs(Module):
         return value * jnp.eye(self.outputs) if value.ndim == 0 else value
 
     def _refuse(self) -> Any:
-        """Raise ValueError: what asks for the law's numbers needs a constant one, and this depends on `inputs`."""
+        """Raise ValueError: what reads the mean or covariance needs a constant law, and this one depends on inputs."""
         expected = "a constant one, as what is computed before data needs"
         raise fail("sensor noise", expected, f"one of {list(self.inputs)}")
 
@@ -123,7 +123,10 @@ def read_function_of_state_alone(measure: object) -> Callable[[jax.Array], Array
 
 
 def require_constant(name: str, value: object) -> Any:
-    """Return a sensor's matrix or noise as it is; raise ValueError for a function, as its inputs have no names here."""
+    """Return a sensor's matrix or noise, the `value`, as it is; raise ValueError if it is a function.
+
+    A function needs named inputs of the sensor, and here it has none. `name` is what it is called in the error.
+    """
     if callable(value):
         expected = "a constant, or inputs=[...], the names of those of the plant that a function takes"
         raise fail(name, expected, "a function")

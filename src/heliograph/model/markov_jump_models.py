@@ -62,7 +62,7 @@ class SwitchingRates(Module):
     def transition_over(self, time: jax.Array) -> jax.Array:
         """Return exp(G t), the transition probabilities (modes, modes) over a time t under the rates G.
 
-        It is computed from the eigenvalues growth_k + i turn_k of G and their projectors real_k + i imaginary_k.
+        It is sum_k e^(growth_k t) (cos(turn_k t) real_k - sin(turn_k t) imaginary_k), by eigenvalues and projectors.
         """
         size = jnp.exp(jnp.asarray(self.growth) * time)
         cosine, sine = size * jnp.cos(self.turn * time), size * jnp.sin(self.turn * time)

@@ -30,9 +30,9 @@ class OverTime(Module):
     def __init__(self, values: object):
         """Hold an array, or a model of arrays, whose leading axes are all time and have one length."""
         self.values = jax.tree.map(_convert_leaf, values)
-        steps = {leaf.shape[0] if leaf.ndim else None for leaf in _list_arrays(self.values)}
-        if len(steps) != 1 or None in steps:
-            raise fail("OverTime", "arrays that share one leading time axis", f"lengths {sorted(map(str, steps))}")
+        lengths = {leaf.shape[0] if leaf.ndim else None for leaf in _list_arrays(self.values)}  # None of a number
+        if len(lengths) != 1 or None in lengths:
+            raise fail("OverTime", "arrays that share one leading time axis", f"lengths {sorted(map(str, lengths))}")
 
     @property
     def steps(self) -> int:
@@ -85,7 +85,7 @@ def have_same_structure(a: object, b: object) -> bool:
 
 
 def _stack_leaves(*leaves: PyTree) -> object:
-    """Return arrays stacked along a new first axis, by JAX if one of them is JAX's."""
+    """Return arrays of one shape stacked along a new first axis: a NumPy array, or JAX's if one of them is JAX's."""
     if any(isinstance(leaf, jax.Array) for leaf in leaves):
         return jnp.stack(leaves)
     return np.stack(leaves)

@@ -99,12 +99,12 @@ class AbstractPlant(Module):
         return Manifold(self.angles, tuple(self.states.index(name) for name in self.attitude))
 
     def difference(self, x: A, other: A) -> A:
-        """Return the change from `other` to x, states (..., n): x - other, angles between -pi and pi, turns."""
+        """Return x - other of states (..., n); for angles between -pi and pi, for attitudes the turn to x."""
         change: A = self.manifold.difference(x, other)
         return change
 
     def plus(self, x: A, change: A) -> A:
-        """Return the state x (..., n) changed: x + change, angles between -pi and pi, attitudes turned."""
+        """Return x + change of a state (..., n): angles are wrapped to -pi to pi, attitudes turned by the change."""
         changed: A = self.manifold.plus(x, change)
         return changed
 
@@ -324,7 +324,7 @@ class LinearPlant(AbstractPlant):
         check_turn_invariance("plant", self.transition, self.initial_mean, self.manifold, self.manifold, u)
 
     def _read_matrix(self, name: str, value: MatrixLike, shape: tuple[int, int]) -> Any:
-        """Return a matrix of the plant as an array, or as a function of the inputs u, with its shape checked."""
+        """Return a plant's matrix of a given shape: an array, or a `MatrixOfInputs` if `value` is a function of u."""
         if not callable(value):
             return array(name, value, shape)
         check_shape(f"{name}(u)", value, (np.zeros(len(self.inputs)),), shape)

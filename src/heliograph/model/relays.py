@@ -79,7 +79,7 @@ class RelayNetwork(Module):
     def received(self) -> tuple[int, ...]:
         """Return how many numbers each filter receives in a step, in the order of `filters`: relays, then the receiver.
 
-        The first link to a filter in any slot tells, since all deliver equally many.
+        It is the number of outputs of the first link to a filter in any slot, since all its links have equally many.
         """
         return tuple(
             next(first(link).outputs for slot in self.slots for link in slot.get(name, {}).values())
@@ -93,9 +93,13 @@ class RelayNetwork(Module):
         return names
 
     def always_receives(self, name: str) -> bool:
-        """Return whether some hop leads to this listener in every slot, and none of them erases."""
-        observed = [slot.get(name, {}) for slot in self.slots]
-        return all(observed) and not any(first(hop).erases for hops in observed for hop in hops.values())
+        """Return whether a listener, a relay or the receiver, gets numbers in every slot.
+
+        In each slot some link leads to it, and none of its links loses messages (erases).
+        """
+        links_by_slot = [slot.get(name, {}) for slot in self.slots]
+        some_link_erases = any(first(link).erases for links in links_by_slot for link in links.values())
+        return all(links_by_slot) and not some_link_erases
 
     def initial(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the mean (n,) and covariance (n, n) of x_0."""

@@ -293,7 +293,7 @@ def _find_output_shape(measure: Callable[[jax.Array], ArrayLike]) -> tuple[int, 
     one, other = (shape(states) for states in LONG)
     if one is not None and other is not None:
         return one if one == other else (1,)
-    shapes = [taken for states in SHORT if (taken := shape(states)) is not None]
+    shapes = [found for found in map(shape, SHORT) if found is not None]
     return shapes[0] if len(shapes) == 1 else (1,)
 
 

@@ -102,9 +102,8 @@ def singer(
     size, rate = _read_deviation_and_rate(deviation, time)
     motion = library(rate).asarray([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, -rate]])
     start = library(size).asarray([WIDE, WIDE, size**2])
-    return _repeat_on_axes(
-        motion, _make_intensity(3, 2 * size**2 * rate), axes, dt, initial_mean, initial_covariance, start
-    )
+    intensity = _make_intensity(order=3, value=2 * size**2 * rate)  # of the acceleration alone
+    return _repeat_on_axes(motion, intensity, axes, dt, initial_mean, initial_covariance, start)
 
 
 def gauss_markov(

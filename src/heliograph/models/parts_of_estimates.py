@@ -58,7 +58,7 @@ class Components:
 
     @property
     def deviation(self) -> Float[np.ndarray, "steps m"]:
-        """Claimed standard deviations (steps, m)."""
+        """Standard deviations (steps, m) of the errors, roots of the claimed variances; NaN where none is claimed."""
         variances = np.diagonal(self.covariance, axis1=-2, axis2=-1)
         return np.asarray(np.sqrt(np.maximum(variances, 0.0)))
 

@@ -61,7 +61,7 @@ class _DenseInverseHessian:
     """Inverse Hessian H as a matrix, first a small multiple of I and then scaled by the first update."""
 
     def __init__(self, gradient: np.ndarray):
-        """Begin with H = I / (10 |gradient|), so that the first step has length 1/10."""
+        """Begin with H = I / (10 |gradient|), so that the first step, -H gradient, has length 1/10."""
         self.matrix = np.eye(len(gradient)) * 0.1 / max(np.linalg.norm(gradient), np.finfo(float).tiny)
         self.is_first_update = True
 

@@ -85,9 +85,11 @@ def receiver_system(network: RelayNetwork, gains: GainsByFilter) -> LinearSystem
     mean[:n], _initial_covariance = network.initial()
     covariance[:d, :d] = initial_error_covariance(network)[:d, :d]
     # The relays' gains as used: zero on what nobody transmits in a slot.
-    ends, receives = np.cumsum(network.received), np.asarray(steps.receives_in_slot)
-    relayed = {name: np.asarray(gains[name]) * receives[:, None, end - size : end]
-               for name, size, end in zip(network.relays, network.received, ends, strict=False)}  # fmt: skip
+    receives = np.asarray(steps.receives_in_slot)  # (steps, R): 1 for each number that arrives
+    relayed = {}
+    ends = np.cumsum(network.received)
+    for name, size, end in zip(network.relays, network.received, ends, strict=False):  # the receiver, last, is left out
+        relayed[name] = np.asarray(gains[name]) * receives[:, None, end - size : end]
     x_of_state = np.eye(n, d + r)  # selects x, the first n states
     assumed = AssumedModel(network.plant, relays=network, gains=relayed)
     return with_assumed(LinearSystem(system, mean, covariance, x_of_state), assumed)

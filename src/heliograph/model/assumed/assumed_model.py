@@ -73,7 +73,7 @@ class AssumedModel:
         self.range, self.encoder = range, encoder
 
     def replaced(self, **parts: Any) -> "AssumedModel":
-        """Return the models that a filter was made for with some of them replaced, such as plant=..."""
+        """Return a copy of these models in which some are replaced, by the names of their attributes (plant=...)."""
         other = copy(self)
         other.__dict__.update(parts)
         return other

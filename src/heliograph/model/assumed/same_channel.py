@@ -161,7 +161,10 @@ def same_observation(
 
 
 def _compose_with_sensor(sensor: AbstractSensor, channel: AbstractRandomAffine) -> AbstractRandomAffine | None:
-    """Return the map from the state to what is received; None unless the sensor is linear, without angles, delays."""
+    """Return the map from the state to what is received: the sensor's y = C x + v, then the channel's z = G y + n.
+
+    None where it is no such map: for a sensor that is not linear or has angles, or a channel that is late.
+    """
     matrix = find_sensor_matrix(sensor)
     if matrix is None or sensor.angles or channel.past:
         return None

@@ -120,21 +120,22 @@ def same_sensor(a: AbstractSensor, b: AbstractSensor, order: int | None) -> bool
 
 
 def _same_sensor_of_inputs(a: AbstractSensor, b: AbstractSensor, order: int | None) -> bool:
-    """Return whether two sensors that depend on inputs are the same programs of state and inputs, with like noise.
+    """Return whether two sensors that depend on inputs u are the same functions h(x, u), with noises that agree.
 
-    `order`: of the moments of noise that a filter uses, None for its whole law.
+    Functions are the same if JAX traces them to the same program. `order`: order of the moments of the noise that a
+    filter uses, None for its whole law.
     """
     if a.inputs != b.inputs or a.angles != b.angles or len(a.outputs) != len(b.outputs):
         return False
-    u = (len(a.inputs),)
+    shape_of_u = (len(a.inputs),)
     if isinstance(a.noise, AbstractNoise) and isinstance(b.noise, AbstractNoise):
         if not same_noise(a.noise, b.noise, order):
             return False
-    elif not same_function(_noise_as_function_of_inputs(a), _noise_as_function_of_inputs(b), u):
+    elif not same_function(_noise_as_function_of_inputs(a), _noise_as_function_of_inputs(b), shape_of_u):
         return False
     # Sensors do not know how many states they measure: any number that both take will do.
     return any(
-        same_function(_measure_as_function_of_inputs(a), _measure_as_function_of_inputs(b), (n,), u)
+        same_function(_measure_as_function_of_inputs(a), _measure_as_function_of_inputs(b), (n,), shape_of_u)
         for n in _find_common_state_length(a, b)
     )
 
@@ -172,5 +173,6 @@ def find_sensor_matrix(sensor: AbstractSensor) -> np.ndarray | None:
         return None if sensor.inputs or is_traced(sensor.matrix) else np.asarray(sensor.matrix)
     if not isinstance(sensor, JointSensor):
         return None
-    matrices = [matrix for part in sensor.parts if (matrix := find_sensor_matrix(part)) is not None]
-    return np.concatenate(matrices) if len(matrices) == len(sensor.parts) else None
+    matrices = [find_sensor_matrix(part) for part in sensor.parts]
+    known_matrices = [matrix for matrix in matrices if matrix is not None]
+    return np.concatenate(known_matrices) if len(known_matrices) == len(matrices) else None

@@ -98,10 +98,10 @@ def _make_gauss_markov(
     deviations = [scalar(what, x, 0.0) for x in _broadcast_to_biases(what, deviation, count)]
     # 1 / T of each.
     rates = [_invert_time_constant(x) for x in _broadcast_to_biases("time of a bias", time, count)]
-    # Deviation and 1 / T of each bias, as arrays (biases,).
+    # Deviation and 1 / T of each bias, as arrays (biases,), JAX's where a number is traced.
     sd, rate = (library(values).stack([library(x).asarray(x) for x in values]) for values in (deviations, rates))
     xp = library(sd, rate)
-    start, center = xp.diag(sd**2), np.zeros(count)
+    start, center = xp.diag(sd**2), np.zeros(count)  # covariance and mean of b_0
     # A step that is a number makes constants; else the matrices are functions of the input that says it.
     if not isinstance(dt, str):
         step = scalar("time of a step", dt, 0.0)

@@ -144,13 +144,16 @@ def _make_clock_plant(clocks: Mapping[str, Clock], dt: str | Any) -> LinearPlant
         wanders.append(wander_of_clock)
         offset = f"{name}_offset"  # in the unit of dt, where that is an input with one
         states += [rename(dt, offset) if isinstance(dt, str) else offset, f"{name}_drift"]
+    # As arrays, JAX's where a number is traced.
     mean, variance, wander = (library(x).asarray(library(x).stack(x)) for x in (means, variances, wanders))
-    one_each, xp = np.eye(len(clocks)), library(variance, wander)
+    xp = library(variance, wander)
     start, strength = xp.diag(variance), xp.diag(wander)
-    # Steps of one length.
+    one_each = np.eye(len(clocks))  # kron(one_each, F) has a block F for each clock
+    # Steps of one length: F = [[1, dt], [0, 1]] of each clock, and its drift alone gains noise.
     if not isinstance(dt, str):
+        matrix = np.kron(one_each, [[1.0, dt], [0.0, 1.0]])
         noise = xp.kron(strength, np.diag([0.0, 1.0]))
-        return LinearPlant(np.kron(one_each, [[1.0, dt], [0.0, 1.0]]), noise, mean, start, states=states)
+        return LinearPlant(matrix, noise, mean, start, states=states)
 
     # Steps of a length that an input says: the integral of white noise in the drift, and of that in the offset.
     def matrix_over(u: jax.Array) -> jax.Array:
@@ -158,7 +161,10 @@ def _make_clock_plant(clocks: Mapping[str, Clock], dt: str | Any) -> LinearPlant
         return jnp.kron(one_each, jnp.array([[1.0, u[0]], [0.0, 1.0]]))
 
     def noise_over(u: jax.Array) -> jax.Array:
-        """Return the noise's covariance over a step of length u[0]."""
+        """Return the covariance of (offset, drift) of all clocks gained over a step of length u[0].
+
+        The drift gains white noise, and the offset its integral: wander [[dt^3 / 3, dt^2 / 2], [dt^2 / 2, dt]] each.
+        """
         of_clock = jnp.array([[u[0] ** 3 / 3, u[0] ** 2 / 2], [u[0] ** 2 / 2, u[0]]])
         return jnp.kron(jnp.asarray(strength), of_clock)
 

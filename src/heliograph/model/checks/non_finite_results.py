@@ -63,7 +63,7 @@ def _plant_fits(plant: AbstractPlant, x: np.ndarray, u: np.ndarray) -> bool:
 
 
 def _measure(sensor: AbstractSensor, x: np.ndarray) -> np.ndarray:
-    """Return h(x), or an empty array if the sensor cannot take a state of this length."""
+    """Return what the sensor measures of a state x, h(x), or an empty array if it takes states of another length."""
     try:
         return np.asarray(sensor.measure(jnp.asarray(x)))
     except (TypeError, ValueError, IndexError):

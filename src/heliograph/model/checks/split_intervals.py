@@ -101,10 +101,12 @@ def _predict_over_intervals(
         for interval in intervals:
             # The step over one interval: F = df/dx at the mean, with angles kept continuous.
             u = jnp.where(np.arange(len(plant.inputs)) == dt, interval, 1.0)
-            F, predicted = jax.jacfwd(plant.make_motion_about(u, mean))(mean), plant.transition(mean, u)
+            F = jax.jacfwd(plant.make_motion_about(u, mean))(mean)
+            predicted = plant.transition(mean, u)
             mean = plant.manifold.settle(predicted, predicted + plant.noise_mean())
             # F F_before, and F P F' + Q of the noise so far.
-            matrix, covariance = F @ matrix, F @ covariance @ F.T + plant.noise_covariance(u)
+            matrix = F @ matrix
+            covariance = F @ covariance @ F.T + plant.noise_covariance(u)
         return mean, matrix, covariance
 
     moved: tuple[jax.Array, jax.Array, jax.Array] = jax.vmap(integrate)(jnp.asarray(intervals))

@@ -123,8 +123,8 @@ class ReadingLimits(Module):
     @property
     def bounded(self) -> bool:
         """Whether a number may count as missing for its value, which tells of the state as a code does not."""
-        limited = bool(np.any(np.isfinite(self.low)) or np.any(np.isfinite(self.high)))
-        return limited or self.stuck is not None
+        has_limits = bool(np.any(np.isfinite(self.low)) or np.any(np.isfinite(self.high)))
+        return has_limits or self.stuck is not None  # a run of equal readings is found by their values too
 
     def screen(self, z: Float[np.ndarray, "time m"], before: Repeats = FIRST) -> ScreenedReadings:
         """Return the readings without those that count as missing, from runs of equal readings before them (`before`).

@@ -123,17 +123,19 @@ def _bound_probability_within_step(
 ) -> Float[np.ndarray, " outputs"]:
     """Return the largest probability that the noise of each output lies in an interval as long as its `step`.
 
-    It is that of the interval around the mean. `step`: the least difference of two readings, such as a converter's.
+    It is that of the interval around the mean, P(|v| <= step / 2). `step`: the least difference of two readings, such
+    as a converter's.
     """
+    # Student's law: 1 - 2 F(-step / (2 scale)), F its distribution function.
     if isinstance(noise, StudentT):
         scale = np.sqrt(np.diagonal(np.asarray(noise.scale)))
         return np.asarray(1 - 2 * scipy.special.stdtr(float(noise.degrees), -step / (2 * scale)))
     if not isinstance(noise, Gaussian | Contaminated):
         raise fail("stuck", "Gaussian, Student's or contaminated noise, or a number of readings", type(noise).__name__)
-    # The noise is a mixture of Gaussians with these shares (as logarithms) and variances.
+    # A mixture of Gaussians with these shares (as logarithms) and variances r: erf(step / sqrt(8 r)) of each.
     log_share, _mean, variance = (np.asarray(numbers) for numbers in noise.branches())
     with np.errstate(divide="ignore"):
-        within_step = scipy.special.erf(step[:, None] / np.sqrt(8 * variance))  # of each Gaussian
+        within_step = scipy.special.erf(step[:, None] / np.sqrt(8 * variance))
     return np.asarray(np.sum(np.exp(log_share) * within_step, axis=1))
 
 

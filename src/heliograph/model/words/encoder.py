@@ -147,7 +147,7 @@ class Words(Module):
         return jnp.asarray(self.low) + index * jnp.asarray(self.step)
 
     def signs(self, index: jax.Array) -> Float[jax.Array, "outputs bits"]:
-        """Return the bits of each word, the lowest first: 1 of a zero, -1 of a one."""
+        """Return the bits of words of given numbers i (outputs,) as signs, the lowest bit first: 1 - 2 b of a bit b."""
         powers = 2.0 ** np.arange(self.bits)
         return 1 - 2 * jnp.mod(jnp.floor(index[:, None] / powers), 2.0)
 
@@ -211,7 +211,10 @@ def _checksum_node_name(node: str) -> int:
 
 
 def _mix_bits(state: np.ndarray) -> np.ndarray:
-    """Return 64 bits mixed by a round of splitmix64 (Steele, Lea and Flood 2014)."""
+    """Return 64-bit numbers whose bits are mixed by the finalizer of the generator splitmix64, as unsigned integers.
+
+    Numbers that differ in one bit become numbers that look unrelated. Source: Steele, Lea and Flood (2014).
+    """
     state = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     state = (state ^ (state >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return cast(np.ndarray, state ^ (state >> np.uint64(31)))
