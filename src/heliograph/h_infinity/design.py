@@ -229,6 +229,7 @@ class _RecursiveDesigner:
         self.system, self.objective, self.solver, self.separate = system, objective, solver, separate
         self.steps, self.coordinates = scale_steps(system, list_step_matrices(system, separate))
         self.layout = UnknownsLayout(system.states, system.received, len(self.steps[0].growth))
+        # Each compiled problem with what it was compiled for: matrices, sizes of x and e, a first weight that couples.
         self.compiled: list[tuple[StepMatrices, tuple[float, float], np.ndarray | None, StepProblem]] = []
 
     def run(self, level: float, initial: Float[np.ndarray, "w w"] | None) -> HInfinityDesign:

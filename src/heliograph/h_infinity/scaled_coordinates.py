@@ -242,14 +242,24 @@ def _choose_eta_scales(system: GrowthSystem, k: int, step: StepMatrices, sizes: 
     """Return the scales T of eta, so that T^-1 eta is of order one, from the scales `sizes` of (x, e) before the step.
 
     eta = (x, e, f, f~, h, h~, disturbances). f is as large as its growth constant times x, and f~ as large as its
-    constant times e. Disturbances are of order one.
+    constant times e. Disturbances are of order one. A function that is zero at all steps is not in eta.
+
+    Args:
+        system: the system with the growth constants of f and h.
+        k: the step.
+        step: its matrices, for the length q of eta.
+        sizes: diag(S1, S2) of (x, e); with growing functions, S1 and S2 are numbers times I.
     """
     n, y = system.states, system.output.shape[1]
     blocks = [sizes]
     for growth, width in ((system.growth, n), (system.output_growth, y)):
-        if not growth.absent:
-            for constant, size in ((growth.state[k], sizes[0, 0]), (growth.error[k], sizes[n, n])):
-                blocks.append((constant * size if constant > 0 else size) * np.eye(width))
+        if growth.absent:
+            continue
+        # The scale of a function, and that of its difference.
+        size_of_x, size_of_e = sizes[0, 0], sizes[n, n]
+        for constant, size in ((growth.state[k], size_of_x), (growth.error[k], size_of_e)):
+            scale = constant * size if constant > 0 else size
+            blocks.append(scale * np.eye(width))
     disturbances = len(step.energy) - sum(map(len, blocks))
     return np.asarray(block_diag(*blocks, np.eye(disturbances)))
 

@@ -99,7 +99,8 @@ class JumpSystem(NamedTuple):
     def operator(self) -> Float[np.ndarray, "e e"]:
         """Return the matrix that takes X before the first step to X after the last, without noise.
 
-        It acts on the e entries of the upper triangles of all modes' moments X.
+        X_j = E[zeta zeta' 1{mode j}] is the second moment of the state in mode j. The matrix acts on the e entries of
+        the upper triangles of all modes' moments.
         """
         without_noise = self._replace(added=0.0 * self.added)
         return np.asarray(make_matrix_on_triangle_entries(without_noise._propagate_one_period, self.shape))
@@ -114,7 +115,8 @@ class JumpSystem(NamedTuple):
     def steady(self) -> Any:
         """Return the steady moments X (time, M, n, n) by mode after each of the steps, which repeat for ever.
 
-        The spectral radius of their operator has to be below 1; else there are no steady moments.
+        X_j = E[zeta zeta' 1{mode j}] is the second moment of the state in mode j. The spectral radius of the steps'
+        `operator` has to be below 1; else there are no steady moments.
         """
         # X after a period is L(X) + C, with X the moments before it. Steady moments solve X = L(X) + C.
         without_noise = self._replace(added=0.0 * self.added)

@@ -106,10 +106,11 @@ def certify_radius(system: KnownLossSystem, gains: KindGains) -> float:
 def find_gains(system: KnownLossSystem) -> KindGains:
     """Return a gain for each kind of mode s, so that the mean error covariance E P stays bounded and small.
 
-    K_s = A U C_s' (C_s U C_s' + R)^-1, with U and R summed over the modes of the kind. First the best filter's
-    covariance recursion, with mean covariances, runs until its gains converge or keep E P bounded. Then policy
-    iteration, which converges faster, improves the gains. If E P is still not bounded, the gains A C^+ (pseudo-inverse)
-    are tried too: if C shows all of x, A - K C is 0 and no old error remains.
+    The links to the receiver are in a mode, such as arrived or lost, which moves as a Markov chain; the receiver knows
+    its kind and uses the kind's constant gain. K_s = A U C_s' (C_s U C_s' + R)^-1, with U and R summed over the modes
+    of the kind. First the best filter's covariance recursion, with mean covariances, runs until its gains converge or
+    keep E P bounded. Then policy iteration, which converges faster, improves the gains. If E P is still not bounded,
+    the gains A C^+ (pseudo-inverse) are tried too: if C shows all of x, A - K C is 0 and no old error remains.
 
     Source: Sinopoli et al. (2004), Theorem 3 (the modified algebraic Riccati equation); by mode for chains.
     """
@@ -119,7 +120,7 @@ def find_gains(system: KnownLossSystem) -> KindGains:
     gains = _iterate_policy(system, gains)
     if system.close_loop(gains).radius() < BELOW_ONE:
         return gains
-    forgetting_gains = tuple(system.transition @ np.linalg.pinv(c) for c in system.outputs)
+    forgetting_gains = tuple(system.transition @ np.linalg.pinv(c) for c in system.outputs)  # A C^+ of each kind
     return min(gains, forgetting_gains, key=lambda candidate: system.close_loop(candidate).radius())
 
 
@@ -156,6 +157,7 @@ def _iterate_policy(system: KnownLossSystem, gains: KindGains) -> KindGains:
     covariance, if there is one. Else V is the direction in which covariances grow fastest, and the noises, which such a
     growth makes negligible, are scaled by 1 / NEGLIGIBLE. The iteration ends if the gains get worse, or stay.
     """
+    # The step V -> V+ under these gains, with its eigenvalues and spectral radius.
     jumps = system.close_loop(gains)
     values, vectors = np.linalg.eig(jumps.operator())
     radius = float(np.max(np.abs(values)))
@@ -236,10 +238,11 @@ def list_eigenspaces(matrix: Float[np.ndarray, "n n"]) -> list[tuple[complex, np
     Eigenvalues that differ by at most SAME times the matrix's norm count as equal. Singular values up to it are zero.
     """
     results: list[tuple[complex, np.ndarray]] = []
-    tolerance = SAME * max(float(np.linalg.norm(matrix, 2)), 1e-300)
+    tolerance = SAME * max(float(np.linalg.norm(matrix, 2)), 1e-300)  # 1e-300: above 0 for a matrix of zeros
     for value in np.linalg.eigvals(matrix):
         is_new = all(abs(value - other) > tolerance for other, _ in results)
         if value.imag >= 0 and is_new:
+            # Eigenvectors span the null space of A - a I: right singular vectors of (nearly) zero singular values.
             _, singular_values, right = np.linalg.svd(matrix - value * np.eye(len(matrix)))
             dimension = max(int(np.sum(singular_values <= tolerance)), 1)
             results.append((complex(value), right.conj().T[:, -dimension:]))
@@ -294,8 +297,8 @@ def _list_modes_not_observing(space: np.ndarray, outputs: Sequence[np.ndarray]) 
 def _find_unobservable_part(output: np.ndarray, space: np.ndarray) -> np.ndarray:
     """Return a basis of the part of a subspace that the rows of an output do not observe; `space` is a basis (n, d).
 
-    Rows are divided by their lengths, so that units do not matter. A direction is not observed if its singular value in
-    these rows is at most UNSEEN.
+    It is the null space of C on the subspace. Rows of C = `output` are divided by their lengths, so that units do not
+    matter. A direction is not observed if its singular value in these rows is at most UNSEEN.
     """
     lengths = np.linalg.norm(output, axis=1)
     is_used = lengths > 0

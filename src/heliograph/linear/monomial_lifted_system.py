@@ -208,7 +208,7 @@ def lifted_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: 
     moments = initial_monomial_moments(plant_0, 2 * degree)
     assumed = AssumedModel(plant, sensor, channel, order=2 * degree)
     if first(channel).remembers:
-        return with_assumed(_lift_chain(routes, degree, moments, (n, m)), assumed)
+        return with_assumed(_lift_chain(routes, degree, moments, n, m), assumed)
     # Start of the lifted state: E Y_0 and Cov Y_0.
     second = products_of_monomials(moments, n + 1, degree)
     mean, covariance = mean_and_covariance(second)
@@ -227,14 +227,19 @@ def lifted_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: 
 
 
 def _lift_chain(
-    routes: Sequence[PlantAndMeasurementMaps], degree: int, moments: Float[np.ndarray, "M"], sizes: tuple[int, int]
+    routes: Sequence[PlantAndMeasurementMaps], degree: int, moments: Float[np.ndarray, "M"], n: int, m: int
 ) -> LinearSystem:
     """Return the linear system of a channel with memory, whose state is the monomials times the flag of each mode.
 
-    `routes` are the maps of each step, x -> x+ (plant) and x+ -> z (measurement). `moments` are those of x_0 up to
-    twice the degree. `sizes` are the numbers of states and of outputs.
+    A flag is 1 in its mode of the channel and 0 in all others.
+
+    Args:
+        routes: the maps of each step, x -> x+ (plant) and x+ -> z (measurement).
+        degree: largest degree of the monomials.
+        moments: moments of x_0 up to twice the degree.
+        n: number of states.
+        m: number of outputs.
     """
-    n, m = sizes
     distinct = {id(r.measurement): r.measurement for r in routes}  # steps share one object where nothing varies
     modes_by_id = {i: joint_modes(measurement, order=degree) for i, measurement in distinct.items()}
     refuse_lift(degree, n, m, len(routes), modes=max(len(modes.initial) for modes in modes_by_id.values()))

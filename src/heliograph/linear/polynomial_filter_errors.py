@@ -135,8 +135,10 @@ class _MomentCache:
             no_noise = Gaussian(np.zeros((n, n)))
             self.last_plant_noise = plant.noise
             self.joint_noise = TabulatedNoise(Independent([plant.noise, no_noise]), order=4)
+        # [[A, 0, 0], [0, I, 0]] of (x, q, z).
         matrix = np.zeros((2 * n, 2 * n + m))
-        matrix[:n, :n], matrix[n:, n : 2 * n] = plant.matrix, np.eye(n)
+        matrix[:n, :n] = plant.matrix
+        matrix[n:, n : 2 * n] = np.eye(n)
         return GainAndNoise(Constant(1.0), matrix, self.joint_noise)
 
     def make_measurement_moments(self, measurement: AbstractRandomAffine, n: int) -> tuple[np.ndarray, np.ndarray]:

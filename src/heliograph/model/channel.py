@@ -345,7 +345,9 @@ def mean_gain(channel: Channel) -> Channel:
 
     def mean_of(channel: AbstractRandomAffine) -> AbstractRandomAffine:
         """Return the channel of one step with its gains at their means; raise ValueError if it remembers."""
-        check_forgets("channel taken at its mean gain", check_maps("channel taken at its mean gain", [channel])[0])
+        what = "channel taken at its mean gain"  # in errors
+        (checked,) = check_maps(what, [channel])
+        check_forgets(what, checked)
         return channel.mean_gain()
 
     at_mean: Channel = at_each_step(mean_of, channel)

@@ -117,7 +117,7 @@ def at(tree: PyTree, k: int | np.integer | Int[np.ndarray | Array, ""]) -> PyTre
     """
 
     def read(leaf: object) -> PyTree:
-        """Return the k-th values of an `OverTime`, anything else as it is."""
+        """Return the k-th values of an `OverTime` in the tree, any other leaf as it is."""
         if not isinstance(leaf, OverTime):
             return leaf
         # Only arrays have an axis of steps. Everything else is the same at all steps.

@@ -266,7 +266,7 @@ def _subtract_on_meridian(
     latitude, middle = origin + phi, origin + phi / 2
     sine_change = 2 * np.cos(middle) * np.sin(phi / 2)  # sin lat - sin lat_0
     cosine_change = -2 * np.sin(middle) * np.sin(phi / 2)  # cos lat - cos lat_0
-    # w and N at the origin (index 0) and at the point.
+    # w and N at the origin (w_0, N_0) and at the point.
     w_0 = np.sqrt(1 - SQUARED_ECCENTRICITY * np.sin(origin) ** 2)
     w = np.sqrt(1 - SQUARED_ECCENTRICITY * np.sin(latitude) ** 2)
     N_0 = SEMI_MAJOR / w_0
@@ -284,8 +284,10 @@ def _subtract_on_meridian(
 def _find_latitude_by_bowring(r: np.ndarray, z: np.ndarray) -> np.ndarray:
     """Return an approximate latitude (radians) by Bowring's formula.
 
-    r: metres from the earth's axis. z: metres above the plane of the equator. beta: the parametric latitude, estimated
-    from the point's direction.
+    It is where Newton's method begins. With the ellipsoid's axes a and b, e^2 its eccentricity squared and
+    e'^2 = e^2 / (1 - e^2), tan lat = (z + e'^2 b sin^3 beta) / (r - e^2 a cos^3 beta), where beta is the parametric
+    latitude, estimated from the point's direction. r: metres from the earth's axis. z: metres above the plane of the
+    equator.
     """
     axis_ratio = 1 - FLATTENING  # b / a
     distance = np.hypot(r, z)

@@ -78,7 +78,7 @@ class ArcMotion(StepLength):
         dt, speed = self.length(u), u[0]
         rate = u[1] if self.wheelbase is None else speed * jnp.tan(u[1]) / self.wheelbase
         half_turn = rate * dt / 2
-        chord = speed * dt * sine_ratio(half_turn)
+        chord = speed * dt * sine_ratio(half_turn)  # an arc of length s = speed dt and angle 2 a: s sin(a) / a
         direction = x[2] + half_turn
         change = jnp.stack([chord * jnp.cos(direction), chord * jnp.sin(direction), rate * dt])
         return jnp.asarray(x + change)

@@ -74,7 +74,8 @@ def sent_mean(step: RelaySteps) -> Float[jax.Array, "sent"]:
     that of C x whatever the gains are.
     """
     mean_of_y = step.sensing @ (step.transition @ step.state_mean + step.drift) + step.sensor_offset
-    mean_of_each_relay, relays = step.sensing @ step.state_mean, len(step.received) - 1
+    mean_of_each_relay = step.sensing @ step.state_mean
+    relays = len(step.received) - 1  # the receiver, the last filter, sends nothing
     return jnp.concatenate([mean_of_y, *[mean_of_each_relay] * relays, jnp.ones(1)])
 
 
@@ -134,7 +135,8 @@ def innovations_above_rounding(predicted: Float[jax.Array, "z z"], step: RelaySt
     difference of large numbers, of which the rounding remains. `predicted` is the covariance of (x, e_1 .. e_F,
     innovations), with x and each filter's error of n entries. ROUNDING is a few units in the last place.
     """
-    n, relays, d = step.transition.shape[-1], len(step.received) - 1, predicted.shape[0] - sum(step.received)
+    n, relays = step.transition.shape[-1], len(step.received) - 1
+    d = predicted.shape[0] - sum(step.received)  # numbers in (x, e_1 .. e_F)
     # Sizes of the numbers sent: |C| (deviation + |mean|) of x by the sensor, and of s_f = x - e_f by each relay.
     deviations = jnp.sqrt(jnp.maximum(jnp.diagonal(predicted)[:d], 0.0)).reshape(-1, n)  # rows: x, e_1 .. e_F
     size_of_state = deviations[0] + jnp.abs(step.state_mean)
@@ -291,7 +293,7 @@ def moment_adjoint(step: RelaySteps, gain: Float[Array, "Fn R"], ahead: Float[Ar
     """
 
     def step_covariance(p: jax.Array) -> jax.Array:
-        """Return P+ from P."""
+        """Return P+, the covariance after the step, from P before it."""
         return correct_moments(step_moments(step, p)[0], gain)
 
     _, pull_back = jax.vjp(step_covariance, jnp.zeros_like(ahead))

@@ -229,8 +229,14 @@ def _evaluate_barrier(
 ) -> tuple[float, Float[np.ndarray, "variables"]]:
     """Return cost - barrier sum log(slack) and its gradient at one vector x, as a descent needs it.
 
-    slack_k is the free share of the power limit at step k. x has r numbers x_k for each step; they change its r free
-    gains by units_k x_k.
+    slack_k is the free share of the power limit at step k.
+
+    Args:
+        problem: the relays' steps, the cost, and the limits on their powers.
+        gains: gains that x changes (time, F n, R).
+        units: units_k (time, r, r): x_k changes the r free gains of step k by units_k x_k.
+        barrier: weight of the logarithm.
+        x: all x_k, one after another (time r,).
     """
     value, gradient = _compute_cost_with_barrier(problem, gains, units, barrier, x.reshape(units.shape[:2]))
     return float(value), np.asarray(gradient).ravel()

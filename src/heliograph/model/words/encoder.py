@@ -120,10 +120,10 @@ class Words(Module):
         return values_of_outputs
 
     def draw_dither(self, key: jax.Array, outputs: int) -> Float[jax.Array, " outputs"]:
-        """Draw the dither of one message: noise that is added to each output before it is rounded to a word.
+        """Draw the dither of one message: noise that is added to each of the outputs before it is rounded to a word.
 
-        It is none, uniform, or triangular (the sum of two uniform numbers), in units of `self.step`, the distance of
-        two words.
+        With the distance D of two words (`self.step`) it is 0 for "none"; D (u_1 + u_2 - 1) for "triangular", with u_1
+        and u_2 uniform from 0 to 1; and D (u_1 - 1/2) for "stochastic" and "subtracted".
         """
         uniform = jax.random.uniform(key, (2, outputs), dtype=float)  # two numbers from 0 to 1 for each output
         match self.dither:
