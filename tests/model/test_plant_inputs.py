@@ -114,6 +114,16 @@ def test_a_step_of_a_filter_alone_judges_what_the_functions_return(door):
             getattr(filter, door)(state, *data, [s], 3)
 
 
+def test_no_rows_are_the_same_for_functions_of_the_inputs_as_for_constants():
+    """No rows give no estimates and the likelihood 1, or what refuses them says so."""
+    filter = network_of(walk).nodes["a"].filters["k"]
+    z, u = np.ones((0, 1)), np.ones((0, 1))
+    assert filter.run(z, u).means.shape == (0, 2)
+    assert hg.log_likelihood(filter, z, u) == 0.0  # of a likelihood of 1, exactly
+    with pytest.raises(ValueError, match="measurements: expected at least one row, got none"):
+        hg.rts_smoother(filter, z, u)
+
+
 def test_a_step_of_a_filter_takes_what_is_traced():
     filter = network_of(lambda u: u[0] * jnp.eye(2), lambda u: jnp.eye(2) / u[0], "s").nodes["a"].filters["k"]
     state = filter.init()

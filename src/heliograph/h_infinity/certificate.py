@@ -43,7 +43,10 @@ class HInfinityCertificate(NamedTuple):
 
     @property
     def text(self) -> str:
-        """One line that says whether the level is certified, and why not, or which growth constants are assumed."""
+        """One line that says whether the level gamma, the error's norm over the disturbances', is certified.
+
+        If not, it says why not; if so, which growth constants it rests on are not proved but assumed.
+        """
         if not self.certified:
             return f"level {self.level:g} is not certified: {'; '.join(self.reasons)}"
         all_proved = "growth constants proved in their boxes, or zero"
@@ -83,18 +86,19 @@ def certify_level(
     """
     instance("system", system, GrowthSystem, "a GrowthSystem, as growth_system makes it")
     level = float(scalar("level", level, low=TINY, high=LARGEST))
-    findings = {"f": _list_findings("growth", growth), "h": _list_findings("output growth", output_growth)}
+    findings_of_f = _list_findings("growth", growth)
+    findings_of_h = _list_findings("output growth", output_growth)
     n, m, T = system.states, system.received, system.steps
     K = array("gains", gains, (T, n, m))
     if np.max(np.abs(K), initial=0.0) > LARGEST:
         raise fail("gains", f"entries of at most {LARGEST:g}", f"{np.max(np.abs(K)):g}")
     P = symmetric_weight("weights", array("weights", weights, (T + 1, 2 * n, 2 * n)))
-    lam = _complete_multipliers(array("multipliers", multipliers, (T, None)))
+    lam = _complete_multipliers(array("multipliers", multipliers, (T, None)))  # of f, f~, h, h~ at each step
     # Phi_k < 0 of every step.
     matrices = [make_theorem_matrix(system, k, K[k], P[k], P[k + 1], lam[k], level) for k in range(T)]
     largest = np.array([_largest_eigenvalue(phi) for phi in matrices])
     negative = np.array([is_negative_definite(phi) for phi in matrices])
-    # Initial condition level^2 W - P_0 > 0, and how far all these are from failing, free of units.
+    # Initial condition level^2 W - P_0 > 0, and how far all these are from failing, in units of the diagonals.
     allowed = level**2 * system.initial_weight
     initial = float(np.linalg.eigvalsh(allowed - P[0])[0])
     initial_margin = smallest_eigenvalue(allowed - P[0], np.sqrt(np.diagonal(allowed)))
@@ -104,9 +108,10 @@ def certify_level(
     if not initial_margin > ROUNDING:
         reasons.append(f"initial condition: the smallest eigenvalue of level^2 W - P_0 is {initial:.3g}, not positive")
     reasons += _list_wrong_signs(P, lam)
-    reasons += _list_objections(system.growth, findings["f"]) + _list_objections(system.output_growth, findings["h"])
-    assumed = _list_assumed_constants("f", system.growth, findings["f"])
-    assumed += _list_assumed_constants("h", system.output_growth, findings["h"])
+    reasons += _list_objections(system.growth, findings_of_f)
+    reasons += _list_objections(system.output_growth, findings_of_h)
+    assumed = _list_assumed_constants("f", system.growth, findings_of_f)
+    assumed += _list_assumed_constants("h", system.output_growth, findings_of_h)
     return HInfinityCertificate(
         certified=not reasons,
         level=level,
@@ -114,14 +119,17 @@ def certify_level(
         steps_certified=T if negative.all() else int(np.argmin(negative)),
         initial=initial,
         margin=margin,
-        growth=tuple(findings["f"] + findings["h"]),
+        growth=tuple(findings_of_f + findings_of_h),
         reasons=tuple(reasons),
         assumed=tuple(assumed),
     )
 
 
 def _list_findings(name: str, given: Sequence[GrowthFinding]) -> list[GrowthFinding]:
-    """Check the growth findings that were given, and return them as a list."""
+    """Return the results of `check_growth` that a user gave, as a list; raise ValueError for anything else among them.
+
+    `name` is what they are called in errors.
+    """
     return [instance(name, finding, GrowthFinding, FINDINGS) for finding in items(name, given, FINDINGS)]
 
 
@@ -153,11 +161,11 @@ def _list_positive(constants: Float[np.ndarray, "steps"]) -> list[float]:
 
 
 def _list_assumed_constants(letter: str, growth: Growth, findings: Sequence[GrowthFinding]) -> list[str]:
-    """List a function's constants that no finding proves.
+    """Return in words the growth constants of a function, called by a `letter`, that no finding proves.
 
-    A finding bounds the slopes in a box, and so the differences of the function in it. If 0 is in the box
-    (`finding.around_zero`) and f(0) = 0, it bounds the function itself too. `growth.state` and `growth.error` hold the
-    constants of f itself and of its differences.
+    A finding is the result of `check_growth`. It bounds the slopes in a box, and so the differences of the function in
+    it. If 0 is in the box (`finding.around_zero`) and f(0) = 0, it bounds the function itself too. `growth.state` and
+    `growth.error` hold the constants of f itself and of its differences.
     """
     around_zero = [finding for finding in findings if finding.around_zero]
     of_function, of_differences = f"|{letter}(x)| <= a |x|", f"|{letter}(x) - {letter}(y)| <= a |x - y|"
@@ -223,17 +231,18 @@ def make_theorem_matrix(
     q = 4 * n + 2 * y + v + r
 
     def rows(height: int, **blocks: np.ndarray) -> Float[np.ndarray, "{height} q"]:
-        """Return rows over eta, q long, that multiply its parts by these blocks, given by the letter of the part.
+        """Return a matrix of `height` rows over eta that has these blocks, each in the columns of a part of eta.
 
-        eta is the vector of all that a step depends on. `at` gives the first index of each part by its letter. Parts
-        without a block get zeros.
+        eta, of length q, is the vector of all that a step depends on. `at` gives the first index of each part by its
+        letter, the name of the block. Parts without a block get zeros: rows(n, x=A) @ eta is A x.
         """
         matrix = np.zeros((height, q))
         for name, block in blocks.items():
             matrix[:, at[name] : at[name] + block.shape[1]] = block
         return matrix
 
-    # V eta, E[G] (C xhat + h(xhat)) and R eta.
+    # The matrices V = [C x + h + D v; rho], E[G] (C xhat + h(xhat)) with xhat = x - e and h(xhat) = h - h~, and
+    # R = [A x + f + B v; A e + f~ + B v + K E[G] (C xhat + h(xhat))], each over eta.
     v_eta = np.concatenate([rows(y, x=C, h=eye(y), v=D), rows(r, r=eye(r))])
     expected = link.mean[:, :y] @ rows(y, x=C, e=-C, h=eye(y), d=-eye(y))
     r_eta = np.concatenate([rows(n, x=A, f=eye(n), v=B), rows(n, e=A, g=eye(n), v=B) + gain @ expected])
@@ -322,7 +331,7 @@ def _largest_eigenvalue(phi: Float[np.ndarray, "q q"]) -> float:
 
 
 def is_negative_definite(phi: Float[np.ndarray, "q q"]) -> bool:
-    """Decide whether a symmetric matrix is negative definite beyond rounding, after scaling its diagonal to -1.
+    """Return whether a symmetric matrix Phi is negative definite beyond rounding, after scaling its diagonal to -1.
 
     Scaling preserves definiteness and lets weights of very different sizes stand in one matrix.
     """
@@ -330,9 +339,10 @@ def is_negative_definite(phi: Float[np.ndarray, "q q"]) -> bool:
 
 
 def _find_scaled_largest(phi: Float[np.ndarray, "q q"]) -> float:
-    """Return the largest eigenvalue of Phi after scaling its diagonal to -1; infinity if the diagonal is not negative.
+    """Return the largest eigenvalue of a symmetric Phi after scaling its diagonal to -1, by s_i s_j on entry ij.
 
-    It has the same sign as the largest eigenvalue of Phi itself, and does not depend on units.
+    It is infinite if the diagonal is not negative, since Phi is then not negative definite. It has the same sign as the
+    largest eigenvalue of Phi itself, and does not depend on units.
     """
     diagonal = np.diagonal(phi)
     if not np.all(diagonal < 0):

@@ -1,5 +1,7 @@
 """H-infinity design by a Riccati recursion, without a solver, behind a channel whose gains are known."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from heliograph.h_infinity.design import HInfinityDesign
@@ -79,12 +81,13 @@ def _run_riccati(system: GrowthSystem, level: float, multipliers: Float[np.ndarr
     design.weights[0] = np.diag(np.repeat([state_weight, error_weight], n))
     # Step by step: K and P2 in closed form, p small enough that it does no harm.
     for k, step in enumerate(list_step_matrices(system, separate=True)):
-        found = _compute_best_gain(system, step, design.weights[k, n:, n:], inner_level, multipliers[k])
+        error_weight_before = design.weights[k, n:, n:]  # P2 of step k
+        found = _compute_best_gain(system, step, error_weight_before, inner_level, multipliers[k])
         if found is None:
             text = f"no gain exists at step {k} of {steps} with these multipliers"
             return design._replace(status=text, failed_step=k)
         design.gains[k], next_error_weight = found
-        state_weight, (multiplier_f, multiplier_h) = _compute_state_weight(system, k, state_weight)
+        state_weight, multiplier_f, multiplier_h = _compute_state_weight(system, k, state_weight)
         no_coupling = np.zeros((n, n))
         design.weights[k + 1] = np.block([[state_weight * np.eye(n), no_coupling], [no_coupling, next_error_weight]])
         design.multipliers[k] = [multiplier_f, multipliers[k, 0], multiplier_h, multipliers[k, 1]]
@@ -122,16 +125,25 @@ def _compute_best_gain(
         return None
     # Take only parts of eta that the form has, and solve for K*; least squares, as U S U' may be singular.
     used = np.flatnonzero(np.diag(inverse_s))
-    S, E, U = np.linalg.inv(inverse_s[np.ix_(used, used)]), step.error[:, used], step.received[:, used]
-    cross, spread = U @ S @ E.T, U @ S @ U.T
-    solution, *_ = np.linalg.lstsq(spread, cross, rcond=None)
-    gain = solution.T
+    S = np.linalg.inv(inverse_s[np.ix_(used, used)])
+    E, U = step.error[:, used], step.received[:, used]
+    USE = U @ S @ E.T
+    K_transposed, *_ = np.linalg.lstsq(U @ S @ U.T, USE, rcond=None)  # U S U' K' = U S E'
+    gain = K_transposed.T
     # P2+, a little smaller (SLACK) for a margin of rounding, and symmetric.
-    next_weight = np.linalg.inv(E @ S @ E.T - gain @ cross)
+    next_weight = np.linalg.inv(E @ S @ E.T - gain @ USE)
     return gain, (1 - SLACK) * (next_weight + next_weight.T) / 2
 
 
-def _compute_state_weight(system: GrowthSystem, k: int, state: float) -> tuple[float, tuple[float, float]]:
+class _NextStateWeight(NamedTuple):
+    """Weight p+ of the next state, P1+ = p+ I, and multipliers of the growth bounds of f and h."""
+
+    weight: float
+    multiplier_f: float
+    multiplier_h: float
+
+
+def _compute_state_weight(system: GrowthSystem, k: int, state: float) -> _NextStateWeight:
     """Return the weight p+ of the next state, P1+ = p+ I, and the multipliers lambda_f and lambda_h of f and h.
 
     No measurement changes x+ = A x + f + B v. f and h are known by |f| <= a |x| and |h| <= b |x|, so that its part of
@@ -150,4 +162,4 @@ def _compute_state_weight(system: GrowthSystem, k: int, state: float) -> tuple[f
     if a > 0:
         multiplier_f = next_weight * (1 + SPARE) ** 2 * float(1 + norm_of_a / a)
     multiplier_h = state * SPARE / (4 * (1 + float(b) ** 2))  # lambda_h b^2 is at most d / 4 of p
-    return next_weight, (multiplier_f, multiplier_h)
+    return _NextStateWeight(next_weight, multiplier_f, multiplier_h)

@@ -113,7 +113,7 @@ def recursive_design(
     tried: dict[float, HInfinityDesign] = {}
 
     def is_feasible(trial: float) -> bool:
-        """Return whether the recursion succeeds at a level; keep its design."""
+        """Return whether the recursion succeeds at a level, `trial`; its design is kept in `tried`."""
         tried[trial] = recursion.run(trial, start)
         return tried[trial].feasible
 
@@ -229,50 +229,66 @@ class _RecursiveDesigner:
         self.system, self.objective, self.solver, self.separate = system, objective, solver, separate
         self.steps, self.coordinates = scale_steps(system, list_step_matrices(system, separate))
         self.layout = UnknownsLayout(system.states, system.received, len(self.steps[0].growth))
+        # Each compiled problem with what it was compiled for: matrices, sizes of x and e, a first weight that couples.
         self.compiled: list[tuple[StepMatrices, tuple[float, float], np.ndarray | None, StepProblem]] = []
 
     def run(self, level: float, initial: Float[np.ndarray, "w w"] | None) -> HInfinityDesign:
         """Return the design at one level, feasible or not.
 
         The level gamma bounds the error M e, e = x - xhat, by the disturbances (v, rho), in sums of squares. P_k is a
-        weight of (x, e) before step k. Each step looks for a gain and a P_k+1 for which the form Phi =
-        E[(x, e)+' P_k+1 (x, e)+] + |M e|^2 - gamma^2 |(v, rho)|^2 - (x, e)' P_k (x, e), plus terms for the growth of
-        the nonlinear functions, is negative: then the sum over all steps gives the bound.
+        weight of (x, e) before step k. Each step looks for a gain and a P_k+1 for which the quadratic form
+        eta'Phi eta = E[(x, e)+' P_k+1 (x, e)+] + |M e|^2 - gamma^2 |(v, rho)|^2 - (x, e)' P_k (x, e), plus terms for
+        the growth of the nonlinear functions, is negative: then the sum over all steps gives the bound. All is computed
+        in scaled coordinates and divided by gamma^2, and stored in the user's units.
 
         Args:
             level: gamma.
             initial: P_0 in the user's units; nearly level^2 W, the largest allowed, if None. W weighs the first (x, e).
         """
         system, n, coordinates = self.system, self.system.states, self.coordinates
-        design = _make_unsolved_design(system, self.separate, level, "")
-        # P_0 in scaled coordinates and, as all weights here, in units of the level squared. The square of too small a
-        # level would be no number.
-        level_squared = (level / coordinates.unit) ** 2
-        too_low = design._replace(status="the initial condition 0 < P_0 < level^2 W fails", failed_step=0)
-        if level_squared < LARGEST**-2:
-            return too_low
-        largest = coordinates.unit**2 * coordinates.scale_initial_weight(system.initial_weight)
-        weight = (
-            (1 - MARGIN) * largest if initial is None else coordinates.scale_initial_weight(initial) / level_squared
-        )
-        if np.linalg.eigvalsh(largest - weight)[0] <= 0 or np.linalg.eigvalsh(weight)[0] <= 0:
-            return too_low
+        design = _make_unsolved_design(system, self.separate, level, "")  # its arrays are filled below
+        level_squared = (level / coordinates.unit) ** 2  # in scaled coordinates
+        weight = self._choose_initial_weight(initial, level_squared)  # P_k / gamma^2
+        if weight is None:
+            return design._replace(status="the initial condition 0 < P_0 < level^2 W fails", failed_step=0)
         design.weights[0] = level_squared * coordinates.unscale_weight(weight, 0)
-        # Step by step: the inequality, then gain, weight and multipliers in the user's units.
         for k, step in enumerate(self.steps):
-            # The part of Phi that is known: M'M / level^2 - |(v, rho)|^2 - P_k.
+            # The part of Phi that is known: M'M / gamma^2 of e, -I of (v, rho), and -P_k of (x, e), which come first.
             fixed = step.target / level_squared - step.energy
             fixed[: 2 * n, : 2 * n] -= weight
+            # The solver's answer must satisfy the inequality itself.
             status, unknowns = self._find_problem(k, weight if k == 0 else None).solve(fixed)
             if unknowns is None or not _inequality_holds(step, unknowns, fixed, SCREEN):
                 text = f"no gain found at step {k} of {system.steps} ({status})"
                 return design._replace(status=text, failed_step=k)
+            # P_k+1 for the next step; gain, weight and multipliers in the user's units. The gain is the nominal one of
+            # the scaled step plus the correction that was found.
             weight = _weigh_state_and_error(unknowns)
             design.gains[k] = coordinates.unscale_gain(step.nominal + _gain_correction(unknowns), k)
             design.weights[k + 1] = level_squared * coordinates.unscale_weight(weight, k + 1)
             multipliers = level_squared * coordinates.unscale_multipliers(unknowns, k)
             design.multipliers[k] = complete_multipliers(system, multipliers, self.separate)
         return design._replace(feasible=True, status="optimal")
+
+    def _choose_initial_weight(
+        self, initial: Float[np.ndarray, "w w"] | None, level_squared: float
+    ) -> Float[np.ndarray, "w w"] | None:
+        """Return P_0 / gamma^2 of the first (x, e) in scaled coordinates; None unless 0 < P_0 < gamma^2 W.
+
+        `initial` is P_0 in the user's units; where it is None, P_0 is nearly gamma^2 W, the largest allowed.
+        `level_squared` is gamma^2 in scaled coordinates.
+        """
+        coordinates = self.coordinates
+        if level_squared < LARGEST**-2:  # its inverse would be no number
+            return None
+        largest = coordinates.unit**2 * coordinates.scale_initial_weight(self.system.initial_weight)  # W
+        if initial is None:
+            weight = (1 - MARGIN) * largest
+        else:
+            weight = coordinates.scale_initial_weight(initial) / level_squared
+        if np.linalg.eigvalsh(largest - weight)[0] <= 0 or np.linalg.eigvalsh(weight)[0] <= 0:
+            return None
+        return weight
 
     def _find_problem(self, k: int, start: Float[np.ndarray, "w w"] | None) -> StepProblem:
         """Return the problem of step k, the one compiled before where its matrices and sizes are the same.
@@ -319,18 +335,21 @@ def _inequality_holds(
 
 
 def _gain_correction(unknowns: Unknowns) -> Float[np.ndarray, "n m"]:
-    """Return K - K0 = P2^-1 Y."""
+    """Return K - K0 = P2^-1 Y, by which the gain of a step differs from its nominal one K0.
+
+    P2 is the weight of the next error, and Y = P2 (K - K0) the solver's unknown in place of the gain.
+    """
     return np.asarray(np.linalg.solve(unknowns.error, unknowns.product))
 
 
 def _weigh_state_and_error(unknowns: Unknowns) -> Float[np.ndarray, "w w"]:
-    """Return diag(P1, P2)."""
+    """Return diag(P1, P2), the weight of (x, e) after a step, from the weights P1 of x and P2 of e that were found."""
     zero = np.zeros_like(unknowns.state)
     return np.block([[unknowns.state, zero], [zero, unknowns.error]])
 
 
 def _make_unsolved_design(system: GrowthSystem, separate: bool, level: float, status: str) -> HInfinityDesign:
-    """Return a design that is not feasible: all its arrays are NaN, and it has the solver's status.
+    """Return a design at a level that is not feasible, or not yet: all its arrays are NaN, and it has a status.
 
     With `separate` each of the four functions f, f~, h, h~ has a multiplier. Else (f, f~) share one, and (h, h~) too.
     """

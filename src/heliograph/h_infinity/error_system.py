@@ -143,7 +143,11 @@ def growth_system(
 def _repeat_over(
     steps: int, name: str, value: Varying, shape: tuple[int | None, ...]
 ) -> Float[np.ndarray, "steps ..."]:
-    """Return the matrix of every step, (steps, *shape)."""
+    """Return a matrix of given shape (None: any length) at every step, (steps, *shape).
+
+    A constant one is repeated; of an `OverTime`, which must cover all steps, later ones are left out. `name` is for
+    error messages.
+    """
     if not isinstance(value, OverTime):
         matrix: np.ndarray = array(name, value, shape)
         return np.broadcast_to(matrix, (steps, *matrix.shape))
@@ -155,7 +159,11 @@ def _repeat_over(
 
 
 def _compute_link_moments(steps: int, channel: Channel) -> tuple[DisturbedGain, ...]:
-    """Return the joint moments of the channel's gain and noise sources at every step; refuse channels that remember."""
+    """Return mean and second moments of (G, N), the channel's random gain and noise, at every step.
+
+    Raises:
+        ValueError: a channel with memory, one over too few steps, or one whose sizes change.
+    """
     check_maps("channel", [first(channel)])
     if first(channel).remembers:
         expected = (
@@ -195,7 +203,8 @@ def _check_initial_weight(value: ArrayLike, n: int) -> Float[np.ndarray, "w w"]:
     name, size = "initial weight", 2 * n
     is_number = rank(name, value) == 0
     matrix: np.ndarray = scalar(name, value) * np.eye(size) if is_number else array(name, value, (size, size))
-    unit = float(np.max(np.abs(matrix), initial=0.0)) or 1.0  # eigenvalues of the largest doubles would overflow
+    # Judged in units of its largest entry: eigenvalues of the largest doubles would overflow.
+    unit = float(np.max(np.abs(matrix), initial=0.0)) or 1.0
     symmetric = symmetric_weight("initial weight", matrix / unit)
     if smallest_eigenvalue(symmetric) <= 0:
         smallest = smallest_eigenvalue(symmetric) * unit
@@ -220,6 +229,10 @@ def symmetric_weight(name: str, matrix: Float[np.ndarray, "*many w w"]) -> Float
 
 
 def smallest_eigenvalue(matrix: Float[np.ndarray, "w w"], units: Float[np.ndarray, "w"] | None = None) -> float:
-    """Return the smallest eigenvalue after scaling the diagonal to 1 or -1, so that units do not decide its sign."""
+    """Return the smallest eigenvalue of a symmetric matrix in units of its components, so that these do not matter.
+
+    Entry ij is divided by u_i u_j. The `units` u are roots of the diagonal's magnitudes unless given, which makes the
+    diagonal 1 or -1. The sign of the eigenvalue does not depend on them.
+    """
     unit = standard_deviations(matrix) if units is None else units
     return float(np.linalg.eigvalsh(matrix / np.outer(unit, unit))[0])

@@ -56,21 +56,22 @@ class HInfinityFilter(AbstractSizedFilter):
 
     @in_float64
     def init(self) -> PendingCorrection:
-        """Return the initial estimate, with no correction."""
+        """Return the state before the first step: the initial estimate (n,), and a pending correction of 0."""
         mean = jnp.asarray(self.initial_mean)
         return PendingCorrection(mean, jnp.zeros_like(mean))
 
     @predicts
     def predict(self, state: PendingCorrection, u: ArrayLike = (), k: Step = 0) -> PendingCorrection:
-        """Predict over step k, corrected with the measurements before it."""
+        """Return xhat+ = f(xhat, u) + the correction that the last measurement made; no correction is pending then."""
         mean = at(self.plant, k).transition(state.mean, jnp.asarray(u)) + state.correction
         return PendingCorrection(mean, jnp.zeros_like(mean))
 
     @corrects
     def correct(self, state: PendingCorrection, z: ArrayLike, k: Step = 0) -> tuple[PendingCorrection, Innovation]:
-        """Compute the correction of the next estimate from z; the current estimate does not change.
+        """Return the state with the correction of the next estimate by z, and the innovation.
 
-        The correction is the gain of step k times (z - mean gain h(x)). A number that did not arrive adds nothing.
+        This is a filter in predictor form: z changes the next estimate, and the present one stays. The correction is
+        the gain of step k times (z - mean gain h(xhat)). A number that did not arrive (NaN) adds nothing.
         """
         value = jnp.asarray(z) - at(self.expected_gain, k) @ at(self.sensor, k).measure(state.mean)
         correction = at(self.gains, k) @ jnp.where(jnp.isnan(value), 0.0, value)
@@ -81,7 +82,7 @@ class HInfinityFilter(AbstractSizedFilter):
 
     @estimates
     def estimate(self, state: PendingCorrection) -> Estimate:
-        """Return the mean of the state, without a covariance."""
+        """Return the filter's estimate of the state: its mean, with NaN as covariance, since none is claimed."""
         n = state.mean.shape[0]
         return Estimate(state.mean, jnp.full((n, n), jnp.nan), self.claim)
 
@@ -160,15 +161,22 @@ def _check_models(plant: AnyPlant, sensor: AnySensor, system: GrowthSystem) -> N
     """
     if first(plant).inputs or first(sensor).inputs:
         return
-    rows = min(system.steps, steps_covered((plant, sensor)) or system.steps)
-    moved = _list_changes(plant, lambda of_step: lambda x: of_step.transition(x, jnp.zeros(0)), system.states)
-    shown = _list_changes(sensor, lambda of_step: of_step.measure, system.states)
+    rows = min(system.steps, steps_covered((plant, sensor)) or system.steps)  # that plant and sensor cover
+
+    def get_transition(plant_of_step: AbstractPlant) -> Callable[[jax.Array], jax.Array]:
+        """Return the transition f(x) of a plant without inputs."""
+        return lambda x: plant_of_step.transition(x, jnp.zeros(0))
+
+    changes_of_plant = _list_changes(plant, get_transition, system.states)
+    changes_of_sensor = _list_changes(sensor, lambda sensor_of_step: sensor_of_step.measure, system.states)
     for k in range(rows):
         if k + 1 < rows:
             expected = f"A x + f(x) of the system's step {k}, which leads to it"
-            _compare(f"plant in row {k + 1}", expected, moved(k + 1), system.transition[k], system.growth.error[k])
+            found = changes_of_plant(k + 1)
+            _compare(f"plant in row {k + 1}", expected, found, system.transition[k], system.growth.error[k])
         expected = f"C x + h(x) of the system's step {k}"
-        _compare(f"sensor in row {k}", expected, shown(k), system.output[k], system.output_growth.error[k])
+        found = changes_of_sensor(k)
+        _compare(f"sensor in row {k}", expected, found, system.output[k], system.output_growth.error[k])
 
 
 def _list_changes(
@@ -180,7 +188,7 @@ def _list_changes(
     """
 
     def compute(k: int) -> Float[np.ndarray, "_ points"]:
-        """Return the value at 0 and the changes of the model of step k."""
+        """Return f(0), and f(x) - f(0) at the unit vectors x, as columns, for the function f of step k."""
         f = choose(at(model, k))
         with jax.enable_x64(True):
             at_zero = f(jnp.zeros(n))
@@ -188,7 +196,7 @@ def _list_changes(
 
     if isinstance(model, OverTime):
         return compute
-    same = compute(0)
+    same = compute(0)  # of a model that does not vary
     return lambda k: same
 
 
@@ -199,6 +207,13 @@ def _compare(
 
     A value at 0 is refused too: behind a random gain it makes an error without any disturbance. ROUNDING: the
     difference, relative to the change, that counts as rounding.
+
+    Args:
+        name: what is compared, in the error message.
+        expected: what it should be, in the error message.
+        found: f(0), and f(x) - f(0) at the unit vectors x, as columns.
+        matrix: A of the system, whose columns are A x at the unit vectors.
+        growth: a of |f(x) - f(y) - A (x - y)| <= a |x - y|.
     """
     at_zero, changes = found[:, 0], found[:, 1:]  # as of `_list_changes`
     if np.linalg.norm(at_zero) > ROUNDING * max(1.0, float(np.linalg.norm(matrix))):

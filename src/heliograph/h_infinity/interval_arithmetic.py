@@ -78,13 +78,16 @@ def bound_program(jaxpr: core.ClosedJaxpr, arguments: Sequence[Interval], contin
 
 
 def point_interval(value: object) -> Interval:
-    """Return the interval that holds a single value."""
+    """Return the interval that holds a known value, or an array of values, alone: both ends are the value."""
     array = np.asarray(value)
     return Interval(array, array)
 
 
 def round_outward(low: object, high: object, ulps: int = 1) -> Interval:
-    """Return the interval with its ends moved outward by `ulps` units in the last place; a NaN end is infinite."""
+    """Return the interval [low, high] with its ends moved outward by `ulps` units in the last place.
+
+    So it holds what exact arithmetic would have given. An end that is NaN, of which nothing is known, becomes infinite.
+    """
     low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
     low, high = np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high)
     for _ in range(ulps):
@@ -162,13 +165,17 @@ def _apply_to_ends(equation: Any, x: list[Interval]) -> list[Interval]:
 
 
 def _apply_to_numbers(equation: Any, ends: list[Numbers]) -> list[Numbers]:
-    """Return the operation's results on numbers."""
+    """Return an operation's results on arrays of numbers, as JAX computes them; `ends` are its arguments."""
     outputs = equation.primitive.bind(*map(jax.device_put, ends), **equation.params)
     return list(map(np.asarray, outputs if equation.primitive.multiple_results else [outputs]))
 
 
 def _compare(name: str, a: Interval, b: Interval) -> Interval:
-    """Return the interval of truth values of a comparison of a and b: (certainly true, possibly true)."""
+    """Return the interval of truth values of a comparison of x in a with y in b.
+
+    Its low end is True where the comparison holds for all such x and y, its high end where it holds for some. `name` is
+    that of JAX's operation: "lt", "le", "gt", "ge", "eq" or "ne".
+    """
     if name in ("gt", "ge"):
         return _compare({"gt": "lt", "ge": "le"}[name], b, a)
     if name == "ne":
@@ -202,7 +209,7 @@ def _select_case(x: list[Interval]) -> Interval:
 
 
 def _bound_product(a: Interval, b: Interval) -> tuple[Numbers, Numbers]:
-    """Return the least and the largest product of ends, not rounded outward."""
+    """Return the least and the largest product x y of x in a and y in b, which are products of ends; not rounded."""
     ends = [x * y for x in a for y in b]
     # An infinite end stands for finite numbers, and 0 times each of them is 0.
     ends = [np.where(np.isnan(end), 0.0, end) for end in ends]
@@ -210,7 +217,10 @@ def _bound_product(a: Interval, b: Interval) -> tuple[Numbers, Numbers]:
 
 
 def _bound_quotient(a: Interval, b: Interval) -> Interval:
-    """Return an interval that holds x / y for x in a and y in b: all numbers, if y may be 0."""
+    """Return an interval that holds x / y for x in a and y in b: all numbers, if y may be 0.
+
+    Else the quotient is monotone in x and in y, so that its extremes are at ends.
+    """
     holds_zero = (b.low <= 0) & (b.high >= 0)
     # Where y may be 0 the divisor is set to 1, and the quotient is not used.
     divisor = Interval(np.where(holds_zero, 1.0, b.low), np.where(holds_zero, 1.0, b.high))
@@ -232,9 +242,10 @@ def _bound_square(a: Interval) -> Interval:
 
 
 def _raise_interval_to_power(a: Interval, exponent: int) -> Interval:
-    """Return an interval of x^k for a whole number k.
+    """Return an interval of x^k for x in a and a whole number k, the `exponent`.
 
-    Even powers depend on |x| alone. A power may be off by ULPS units in the last place.
+    Odd powers are monotone; even ones depend on |x| alone, and are monotone in it. x^-k is 1 / x^k. A power may be off
+    by ULPS units in the last place.
     """
     if exponent < 0:
         unit_interval = point_interval(np.ones_like(a.low))
@@ -245,18 +256,23 @@ def _raise_interval_to_power(a: Interval, exponent: int) -> Interval:
 
 def _bound_absolute(a: Interval) -> Interval:
     """Return the interval of |x|, from 0 where x may be 0."""
-    least, largest = np.minimum(np.abs(a.low), np.abs(a.high)), np.maximum(np.abs(a.low), np.abs(a.high))
-    return Interval(np.where((a.low <= 0) & (a.high >= 0), 0.0, least), largest)
+    sizes_of_ends = np.abs(a.low), np.abs(a.high)
+    least, largest = np.minimum(*sizes_of_ends), np.maximum(*sizes_of_ends)
+    holds_zero = (a.low <= 0) & (a.high >= 0)
+    return Interval(np.where(holds_zero, 0.0, least), largest)
 
 
 def _make_monotone_bound(
     function: Callable[[Numbers], Numbers], low: float = -np.inf, high: float = np.inf
 ) -> Callable[..., Interval]:
-    """Return the interval version of a nondecreasing function, whose values lie between `low` and `high`."""
+    """Return the interval version of a nondecreasing function, whose values lie between `low` and `high`.
+
+    The ends of an interval go to the ends of its values, widened by the error of the library's function (ULPS).
+    """
 
     def call(a: Interval) -> Interval:
         """Return the interval of the function's values on an interval of its argument."""
-        values = round_outward(function(a.low), function(a.high), ULPS)  # ULPS: error of a library's function
+        values = round_outward(function(a.low), function(a.high), ULPS)
         return Interval(np.maximum(values.low, low), np.minimum(values.high, high))
 
     return call

@@ -79,9 +79,13 @@ class GrowthFinding(NamedTuple):
 
     @property
     def refuted(self) -> bool:
-        """True if a pair, a slope or f(0) breaks the constant."""
-        steep = self.differences and not self.slope <= self.limit
-        return steep or not self.ratio <= self.limit or not self.starts_at_zero
+        """True if evidence breaks the constant a: a pair, a slope, or an f(0) other than 0.
+
+        A slope counts where a is to bound differences of f; |f(x)| <= a |x| alone allows steep slopes.
+        """
+        is_too_steep = self.differences and not self.slope <= self.limit  # NaN counts as too steep
+        has_too_large_ratio = not self.ratio <= self.limit
+        return is_too_steep or has_too_large_ratio or not self.starts_at_zero
 
     @property
     def proved(self) -> bool:
@@ -90,7 +94,10 @@ class GrowthFinding(NamedTuple):
 
     @property
     def text(self) -> str:
-        """One line that says whether the constant is proved, assumed or false in the box, and why."""
+        """One line that says whether the growth constant is proved, assumed or false in the box, and why.
+
+        It is false if a point or a pair refutes it, proved if a bound of all slopes is within it, assumed otherwise.
+        """
         region = f"in the box from {np.round(self.low, 4).tolist()} to {np.round(self.high, 4).tolist()}"
         if self.proved:
             return f"{self.name}: constant {self.constant:g} is proved {region} (no slope above {self.bound:.6g})"
@@ -180,7 +187,10 @@ def _check_box(low: ArrayLike, high: ArrayLike) -> tuple[Float[np.ndarray, "n"],
 
 
 class _LipschitzMeter:
-    """Slopes and ratios of a function at points (count, n) or pairs (count, 2n), compiled once; width: of the box."""
+    """Slopes |Jacobian| of a function at points (count, n), and ratios |f(x) - f(y)| / |x - y| of pairs (count, 2n).
+
+    A pair is x and y behind each other. Function and Jacobian are compiled once. `width` is that of the box.
+    """
 
     def __init__(self, function: Function, width: float):
         """Compile the function and its Jacobian; `width` is that of the region, by which distances are judged."""
@@ -189,7 +199,7 @@ class _LipschitzMeter:
         self.values = _compile_by_part(jax.vmap(lambda x: jnp.atleast_1d(function(x))))
 
     def measure_slopes(self, points: Float[np.ndarray, "count n"]) -> Float[np.ndarray, "count"]:
-        """Return the norm of the Jacobian at each point, and infinity where the Jacobian is not finite."""
+        """Return the spectral norm of the Jacobian at each point, infinite where the Jacobian is not finite."""
         values = np.asarray(self.jacobian(points))
         is_finite = np.isfinite(values).all(axis=(-2, -1))
         finite_values = np.where(is_finite[:, None, None], values, 0.0)
@@ -197,7 +207,9 @@ class _LipschitzMeter:
 
     def find_steepest_directions(self, points: Float[np.ndarray, "count n"]) -> Float[np.ndarray, "count n"]:
         """Return the unit direction in which the function changes most at each point."""
-        return np.linalg.svd(np.nan_to_num(self.jacobian(points), posinf=0.0, neginf=0.0))[2][:, 0]
+        jacobians = np.nan_to_num(self.jacobian(points), posinf=0.0, neginf=0.0)
+        _left, _singular_values, right = np.linalg.svd(jacobians)
+        return right[:, 0]  # the right singular vector of the largest singular value
 
     def measure_ratios(self, pairs: Float[np.ndarray, "count both"]) -> Float[np.ndarray, "count"]:
         """Return the ratio |f(x) - f(y)| / |x - y| of each pair, 0 if x and y are so close that it is rounding."""
@@ -226,11 +238,19 @@ def _search_slopes_and_pairs(
     high: Float[np.ndarray, "n"],
     random: np.random.Generator,
 ) -> tuple[Float[np.ndarray, "points n"], Float[np.ndarray, "pairs n+n"]]:
-    """Return points of large slopes in the box, and pairs (x, y) of large ratios |f(x) - f(y)| / |x - y|."""
+    """Return points of large slopes in the box, and pairs (x, y) of large ratios |f(x) - f(y)| / |x - y|.
+
+    Args:
+        meter: measures slopes and ratios of the function f.
+        starts: points of the box with which the search begins.
+        low: lower corner of the box.
+        high: upper corner.
+        random: generator of the search's moves.
+    """
     # Largest slope: the starts, then random moves from the steepest.
     points = _climb_at_random(meter.measure_slopes, starts, low, high, random)
     # Largest ratio: close pairs along the steepest directions, and as many pairs of any two points of the box.
-    move = meter.find_steepest_directions(points) * NEARBY * meter.width / 2
+    move = meter.find_steepest_directions(points) * NEARBY * meter.width / 2  # half of a pair's distance
     close = np.concatenate([np.clip(points - move, low, high), np.clip(points + move, low, high)], axis=1)
     far = low + (high - low) * random.random((POINTS, 2, len(low)))
     pairs = np.concatenate([close, far.reshape(POINTS, -1)])
@@ -238,11 +258,15 @@ def _search_slopes_and_pairs(
 
 
 def _compile_by_part(function: Callable[[Any], jax.Array]) -> Callable[[np.ndarray], np.ndarray]:
-    """Return a function of points, compiled for CLIMBERS * TRIALS (as many as a climb tries) at a time."""
+    """Return the function of points (count, n), compiled once, for a fixed number of points at a time.
+
+    A compiled program takes one shape alone; any other count is cut into parts. The number is CLIMBERS * TRIALS, as
+    many as one round of the search tries.
+    """
     compute = compile_in_float64(function)
 
     def call(points: np.ndarray) -> np.ndarray:
-        """Compute the points in parts of `size`; copies of the last point fill up the last part."""
+        """Return the function at points (count, n), in parts of `size`; copies of the last point fill the last part."""
         size = CLIMBERS * TRIALS
         padded = np.concatenate([points, np.repeat(points[-1:], -len(points) % size, axis=0)])
         values = [compute(padded[start : start + size]) for start in range(0, len(padded), size)]
@@ -305,15 +329,27 @@ def _climb_at_random(
     high: Float[np.ndarray, "n"],
     random: np.random.Generator,
 ) -> Float[np.ndarray, "climbers n"]:
-    """Return the CLIMBERS best starts, each moved to the best of random moves around it ROUNDS times, in the box."""
+    """Return points of the box where an objective is large: a random search that climbs from the best `starts`.
+
+    The CLIMBERS best starts are kept. In each of ROUNDS rounds each moves to the best of TRIALS points, itself and
+    random ones around it, whose distance shrinks by SHRINK from round to round.
+
+    Args:
+        objective: from points (count, n) to the numbers (count,) that are to be large.
+        starts: points to begin with.
+        low: lower corner of the box.
+        high: upper corner.
+        random: generator of the moves.
+    """
     climbers = starts[np.argsort(-objective(starts), kind="stable")[:CLIMBERS]]
     deviation = (high - low) / 2
     for _ in range(ROUNDS):
-        # TRIALS normal moves of each, the first of which stays, then smaller ones.
+        # TRIALS normal moves of each, the first of which stays.
         trials = climbers[:, None] + deviation * random.normal(size=(len(climbers), TRIALS, len(low)))
         trials[:, 0] = climbers
         trials = np.clip(trials, low, high)
         values = objective(trials.reshape(-1, len(low))).reshape(len(climbers), TRIALS)
-        climbers = trials[np.arange(len(climbers)), values.argmax(axis=1)]
+        best = values.argmax(axis=1)  # of each climber's trials
+        climbers = trials[np.arange(len(climbers)), best]
         deviation = SHRINK * deviation
     return climbers

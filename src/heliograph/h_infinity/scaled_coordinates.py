@@ -18,8 +18,12 @@ SMALLEST = 1e-6  # of what an error's size was before a measurement: as small as
 class ScaledCoordinates(NamedTuple):
     """Scaled coordinates in which a design is computed, and the way back to the user's units.
 
-    states: (x, e) = diag(S1, S2) times scaled ones, before every step and after the last. received: scales of what is
-    received; forms: of the growth forms; unit: of the level. nothing_grows: whether f and h are zero.
+    Args:
+        states: diag(S1, S2) of (x, e) = diag(S1, S2) (scaled x, scaled e), before every step and after the last.
+        received: size of each received number at each step.
+        forms: size of each growth form, a quadratic form that bounds an unknown function, at each step.
+        unit: in which the level is measured.
+        nothing_grows: whether the unknown functions f and h are both zero.
     """
 
     states: Float[np.ndarray, "times w w"]
@@ -52,16 +56,22 @@ class ScaledCoordinates(NamedTuple):
         return self.unit**2 * _symmetrise(np.linalg.solve(self.states[k].T, half.T))
 
     def scale_initial_weight(self, weight: Float[np.ndarray, "w w"]) -> Float[np.ndarray, "w w"]:
-        """Return the weight P_0 in scaled coordinates."""
+        """Return the weight P_0 of the first (x, e) in scaled coordinates, S'P_0 S / unit^2 with S = diag(S1, S2)."""
         return _symmetrise(self.states[0].T @ weight @ self.states[0]) / self.unit**2
 
     def unscale_gain(self, scaled: Float[np.ndarray, "n m"], k: int) -> Float[np.ndarray, "n m"]:
-        """Return the gain of step k in the user's units."""
+        """Return the gain of step k in the user's units, S2 K r^-1.
+
+        It takes what is received, of sizes r, to a correction of e, of scale S2 after the step.
+        """
         n = len(scaled)
         return np.asarray(self.states[k + 1, n:, n:] @ scaled / self.received[k])
 
     def unscale_multipliers(self, unknowns: Unknowns, k: int) -> Float[np.ndarray, "multipliers"]:
-        """Return the multipliers of step k in the user's units."""
+        """Return the multipliers of the growth forms of step k in the user's units, from those that were found.
+
+        A form was divided by its size and the inequality by unit^2, so a multiplier is multiplied by their ratio.
+        """
         return np.asarray(self.unit**2 * unknowns.multipliers / self.forms[k])
 
 
@@ -90,11 +100,12 @@ def scale_steps(
         # Covariances of (x, e) after the step with the nominal gain, and scales from these.
         eta = _compute_eta_covariance(system, k, step, x, e)
         largest_target = max(largest_target, float(np.trace(step.target @ eta)))
-        x, e, received, gain = _propagate_covariances(step, eta, None if gains is None else gains[k])
+        after = _propagate_covariances(step, eta, None if gains is None else gains[k])
+        x, e = after.state, after.error
         is_taken_as_it_is = gains is not None or k == 0  # else the gain of the step before may serve
-        nominal = gain if is_taken_as_it_is else _keep_gain(nominal, gain, received, e)
+        nominal = after.gain if is_taken_as_it_is else _keep_gain(nominal, after.gain, after.innovation, e)
         state_scales.append(_choose_state_scales(x, e, nothing_grows))
-        received_scales.append(_powers_of_four_near(np.sqrt(np.diagonal(received))))
+        received_scales.append(_powers_of_four_near(np.sqrt(np.diagonal(after.innovation))))
         eta_scales = _choose_eta_scales(system, k, step, state_scales[k])
         # Scales that make the largest entry of each growth form 1. Forms are diagonal, and so, with growth, are the
         # scales of eta.
@@ -123,8 +134,9 @@ def _nearest_power_of_four(size: Float[np.ndarray, "*n"] | float) -> Float[np.nd
 def _choose_state_scales(x: np.ndarray, e: np.ndarray, nothing_grows: bool) -> Float[np.ndarray, "w w"]:
     """Return scales diag(S1, S2) of x and e from their covariances.
 
-    x is the state and e the error. Where nothing grows, S1 and S2 are factors of the covariances. Else they are
-    multiples of I, since a growth bound such as |f(x)| <= a |x| keeps its meaning under these alone.
+    x is the state and e the error. `nothing_grows` says that plant and sensor have no unknown functions. Then S1 and S2
+    are factors of the covariances. Else they are multiples of I, since a growth bound such as |f(x)| <= a |x| keeps its
+    meaning under these alone.
     """
     if nothing_grows:
         return np.asarray(block_diag(_factor_with_floor(x), _factor_with_floor(e)))
@@ -133,7 +145,7 @@ def _choose_state_scales(x: np.ndarray, e: np.ndarray, nothing_grows: bool) -> F
 
 
 def _factor_with_floor(covariance: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
-    """Return the lower factor of a covariance to which a little variance is added.
+    """Return the lower factor L, L L' = P + a little variance, of a covariance P.
 
     A state that is never disturbed has no variance of its own. So SMALLEST, 1e-6, of each unit is added. Units are
     powers of four, since scaling by them does not round.
@@ -183,9 +195,16 @@ def _compute_eta_covariance(
     return covariance
 
 
-def _propagate_covariances(
-    step: StepMatrices, eta: np.ndarray, given: np.ndarray | None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+class _CovariancesAfterStep(NamedTuple):
+    """Covariances of the next state x+ and error e+, of the innovation, and the gain K that the error had."""
+
+    state: Float[np.ndarray, "n n"]
+    error: Float[np.ndarray, "n n"]
+    innovation: Float[np.ndarray, "m m"]
+    gain: Float[np.ndarray, "n m"]
+
+
+def _propagate_covariances(step: StepMatrices, eta: np.ndarray, given: np.ndarray | None) -> _CovariancesAfterStep:
     """Return the covariances of x+, of e+ and of the innovation, and the gain K: the `given` one, or the best.
 
     With the covariance Cov eta = `eta` of all that the step depends on: x+ = X eta, the innovation is (U + W) eta with
@@ -194,41 +213,53 @@ def _propagate_covariances(
     E, U = step.error, step.received
     # R = Cov (U + W) eta = U Cov eta U' + sum_j U_j Cov eta U_j'.
     by_mean = U @ eta @ U.T
-    received = by_mean + np.einsum("jai,ik,jbk->ab", step.spreads, eta, step.spreads)
+    R = by_mean + np.einsum("jai,ik,jbk->ab", step.spreads, eta, step.spreads)
     # The best gain E Cov eta U' R^-1, computed in units of the innovation's deviations.
     cross = E @ eta @ U.T
-    unit = np.sqrt(np.maximum(np.diagonal(received), np.finfo(float).tiny))
-    best = cross / unit @ np.linalg.pinv(received / np.outer(unit, unit), rcond=RANK, hermitian=True) / unit
+    unit = np.sqrt(np.maximum(np.diagonal(R), np.finfo(float).tiny))
+    best = cross / unit @ np.linalg.pinv(R / np.outer(unit, unit), rcond=RANK, hermitian=True) / unit
     gain = best if given is None else given
     # (E - K U) Cov eta (E - K U)' + K (R - U Cov eta U') K', and of each variance at least SMALLEST^2 of the predicted.
     predicted, corrected_map = E @ eta @ E.T, E - gain @ U
-    corrected = corrected_map @ eta @ corrected_map.T + gain @ (received - by_mean) @ gain.T
+    corrected = corrected_map @ eta @ corrected_map.T + gain @ (R - by_mean) @ gain.T
     floor = SMALLEST**2 * np.diag(np.diagonal(predicted))
-    return step.state @ eta @ step.state.T, _symmetrise(corrected) + floor, received, gain
+    return _CovariancesAfterStep(
+        state=step.state @ eta @ step.state.T, error=_symmetrise(corrected) + floor, innovation=R, gain=gain
+    )
 
 
-def _keep_gain(last: np.ndarray, best: np.ndarray, received: np.ndarray, after: np.ndarray) -> np.ndarray:
+def _keep_gain(last: np.ndarray, best: np.ndarray, innovation: np.ndarray, error: np.ndarray) -> np.ndarray:
     """Return the last step's gain K0 if it is nearly as good as the best gain K, else K.
 
-    Steps with the same gain are compiled once. K0 adds (K - K0) R (K - K0)' to the covariance `after` the correction,
-    with R the covariance of what is received. It may add the share CONVERGED, 0.1, of each variance.
+    Steps with the same gain are compiled once. K0 adds (K - K0) R (K - K0)' to the covariance of the `error` after the
+    correction, with R the covariance of the `innovation`. It may add the share CONVERGED, 0.1, of each variance.
     """
-    added = (last - best) @ received @ (last - best).T
-    return last if np.all(np.diagonal(added) <= CONVERGED * np.diagonal(after)) else best
+    added = (last - best) @ innovation @ (last - best).T
+    return last if np.all(np.diagonal(added) <= CONVERGED * np.diagonal(error)) else best
 
 
 def _choose_eta_scales(system: GrowthSystem, k: int, step: StepMatrices, sizes: np.ndarray) -> Float[np.ndarray, "q q"]:
     """Return the scales T of eta, so that T^-1 eta is of order one, from the scales `sizes` of (x, e) before the step.
 
     eta = (x, e, f, f~, h, h~, disturbances). f is as large as its growth constant times x, and f~ as large as its
-    constant times e. Disturbances are of order one.
+    constant times e. Disturbances are of order one. A function that is zero at all steps is not in eta.
+
+    Args:
+        system: the system with the growth constants of f and h.
+        k: the step.
+        step: its matrices, for the length q of eta.
+        sizes: diag(S1, S2) of (x, e); with growing functions, S1 and S2 are numbers times I.
     """
     n, y = system.states, system.output.shape[1]
     blocks = [sizes]
     for growth, width in ((system.growth, n), (system.output_growth, y)):
-        if not growth.absent:
-            for constant, size in ((growth.state[k], sizes[0, 0]), (growth.error[k], sizes[n, n])):
-                blocks.append((constant * size if constant > 0 else size) * np.eye(width))
+        if growth.absent:
+            continue
+        # The scale of a function, and that of its difference.
+        size_of_x, size_of_e = sizes[0, 0], sizes[n, n]
+        for constant, size in ((growth.state[k], size_of_x), (growth.error[k], size_of_e)):
+            scale = constant * size if constant > 0 else size
+            blocks.append(scale * np.eye(width))
     disturbances = len(step.energy) - sum(map(len, blocks))
     return np.asarray(block_diag(*blocks, np.eye(disturbances)))
 
@@ -244,14 +275,18 @@ def _rescale_step(
     """Return the step in scaled coordinates, with errors about the nominal gain.
 
     An H-infinity bound is a matrix inequality in the vector eta of state, error, unknown functions and disturbances;
-    its solver needs numbers of order one. A matrix M that maps eta to the error becomes S2^-1 M T, a quadratic form M
-    becomes T' M T.
+    its solver needs numbers of order one. With eta = T (scaled eta), x+ = S1 (scaled x+), e+ = S2 (scaled e+) and sizes
+    r of what is received,
+      x+ = X eta                         becomes  S1^-1 X T     (`state`),
+      e+ = E eta - K (received)          becomes  S2^-1 (E - K0 U) T, less a scaled correction of K0   (`error`),
+      received = U eta, deviations U_j   become   r^-1 U T and r^-1 U_j T   (`received`, `spreads`),
+      a quadratic form eta'F eta         becomes  T'F T   (`target` |M e|^2, `energy` |(v, rho)|^2, `growth`).
 
     Args:
         step: matrices of the step in the user's units.
         eta_scales: T of eta = T times scaled eta.
         state_scales: diag(S1, S2), the scales of (x, e) after the step: x = S1 times scaled x, e = S2 times scaled e.
-        received_scales: a scale for each received number.
+        received_scales: r, the size of each received number.
         form_scales: a scale for each growth form, a diagonal quadratic form that bounds an unknown function.
         nominal: the gain K0: the error's matrix becomes E - K0 U, where U maps eta to the received numbers.
     """

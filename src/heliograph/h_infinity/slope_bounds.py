@@ -34,7 +34,8 @@ def prove_slope_bound(
     try:
         with jax.enable_x64(True):
             example = jnp.zeros((BOXES, len(low)))
-            # The function itself over the whole box: refused unless it is continuous.
+            # The function itself over the whole box: refused unless it is continuous. Programs take BOXES boxes at
+            # once, so the box is repeated.
             values = jax.vmap(lambda x: jnp.atleast_1d(function(x)))
             whole_box = Interval(np.tile(low, (BOXES, 1)), np.tile(high, (BOXES, 1)))
             bound_program(jax.make_jaxpr(values)(example), [whole_box], continuous=True)
@@ -47,7 +48,16 @@ def prove_slope_bound(
 def _sharpen_bound(
     slopes: jax.extend.core.ClosedJaxpr, low: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"], goal: float
 ) -> float:
-    """Return the largest bound of a slope, after halving boxes whose bound is above the goal, LIMIT boxes at most."""
+    """Return a bound of all slopes in a box, as sharp as the `goal` if that takes at most LIMIT boxes.
+
+    Boxes whose bound is above the goal are halved, since bounds by interval arithmetic are sharper over smaller boxes.
+
+    Args:
+        slopes: program of the Jacobian at BOXES points.
+        low: lower corner of the box (n,).
+        high: upper corner (n,).
+        goal: the slope that is not to be exceeded.
+    """
     bottoms, tops = low[None], high[None]
     largest_within = 0.0  # bound of the boxes that are within the goal
     boxes_seen = 0
@@ -67,22 +77,36 @@ def _sharpen_bound(
 def _bound_slopes(
     slopes: jax.extend.core.ClosedJaxpr, low: np.ndarray, high: np.ndarray
 ) -> Float[np.ndarray, " boxes"]:
-    """Return a bound of the Jacobian's norm over each box, infinite where the interval arithmetic says nothing."""
+    """Return a bound of the Jacobian's norm over each box, infinite where the interval arithmetic says nothing.
+
+    Interval arithmetic gives ends of each entry of J, so J = C +- R with the middle C and half the width R. Then
+    |J| <= |C| + |R| in the spectral norm.
+
+    Args:
+        slopes: program of the Jacobian J at BOXES points.
+        low: lower corners of the boxes (boxes, n).
+        high: upper corners.
+    """
     # The program is for BOXES boxes: fewer are padded.
     padding = BOXES - len(low)
     ends = [np.concatenate([end, np.repeat(end[-1:], padding, axis=0)]) for end in (low, high)]
     (jacobian,) = bound_program(slopes, [Interval(*ends)], continuous=False)
-    # |J| <= |C| + |R| for J in C +- R.
     is_finite = np.isfinite(jacobian.low) & np.isfinite(jacobian.high)
     lowest, highest = np.where(is_finite, jacobian.low, 0.0), np.where(is_finite, jacobian.high, 0.0)
-    centre = lowest / 2 + highest / 2
-    radius = np.nextafter(np.maximum(highest - centre, centre - lowest), np.inf)
-    norms = sum(np.linalg.norm(matrix, 2, axis=(-2, -1)) for matrix in (centre, radius))
+    C = lowest / 2 + highest / 2
+    R = np.nextafter(np.maximum(highest - C, C - lowest), np.inf)
+    norms = sum(np.linalg.norm(matrix, 2, axis=(-2, -1)) for matrix in (C, R))  # |C| + |R|
     return np.where(is_finite.all(axis=(1, 2)), norms * (1 + NORM_ROUNDING), np.inf)[: len(low)]
 
 
 def _halve_boxes(low: np.ndarray, high: np.ndarray, width: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return every box in two, halved across its widest side relative to `width`, the sides of the whole region."""
+    """Return the lower and the upper corners of twice as many boxes: each is halved across its widest side.
+
+    Args:
+        low: lower corners of the boxes (boxes, n).
+        high: upper corners.
+        width: lengths of the sides of the whole region (n,), relative to which a side is wide.
+    """
     sides = np.argmax((high - low) / np.where(width > 0, width, 1.0), axis=1)
     rows = np.arange(len(low))
     middle = (low[rows, sides] + high[rows, sides]) / 2

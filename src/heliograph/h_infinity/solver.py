@@ -4,7 +4,7 @@ import math
 import warnings
 from collections.abc import Callable
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -119,8 +119,8 @@ class StepProblem:
         self.fixed = cp.Parameter(step.energy.shape, symmetric=True)
         forms, n = make_linear_forms(step, layout), layout.states
         constraints = self._list_constraints(cp, step, forms, start)
-        # One or two objectives on the weight's diagonal blocks, of x and of e, minimised one after another. `reached`
-        # is the best value of the first, which the second keeps.
+        # One or two objectives on the weight's diagonal blocks, of x and of e, optimised one after another. `reached`
+        # is the best value of the first, which the second keeps; `more` are the constraints that express an objective.
         weight = cp.reshape(forms.weight @ self.unknowns, (2 * n, 2 * n), order="C")
         self.reached = cp.Parameter()
         goals = _list_objectives(cp, objective, [weight[:n, :n], weight[n:, n:]], sizes, self.reached)
@@ -209,6 +209,19 @@ def _list_objectives(
     ]
 
 
+class AffineMatrix(NamedTuple):
+    """Matrix (w, w) that is affine in the unknowns: constant + sum_i maps_i @ (unknowns of slice i).
+
+    Args:
+        maps: by the number i of a slice of the vector of all unknowns, the linear map from these to the matrix, which
+            is written row by row (w w, length of the slice).
+        constant: the part without unknowns (w, w).
+    """
+
+    maps: dict[int, np.ndarray]
+    constant: Float[np.ndarray, "w w"]
+
+
 class HorizonProblem:
     """Convex problem of all steps at once: P_1 ... P_T+1, gains, multipliers and the level squared are unknown.
 
@@ -247,16 +260,15 @@ class HorizonProblem:
         self.slices = [slice(end - size, end) for size, end in zip(sizes, np.cumsum(sizes), strict=True)]
         self.unknowns = cp.Variable(sum(sizes))
         self.constraints: list[Constraint] = []
-        # The weight P before a step is a constant plus linear maps of unknowns, by the slice of these in the vector. At
-        # the start it is nearly level^2 W, which is linear in the level squared; or it is P_0, a constant below that.
+        # The weight P before the first step: nearly level^2 W, which is linear in the level squared (slice 0); or P_0,
+        # a constant with level^2 W - P_0 >= 0, but for a margin.
         largest_initial = {0: (1 - MARGIN) * weight.ravel()[:, None]}
         if initial is None:
-            weight_forms, weight_constant = largest_initial, np.zeros_like(weight)
+            weight_before = AffineMatrix(maps=largest_initial, constant=np.zeros_like(weight))
         else:
-            # level^2 W - P_0 >= 0, but for a margin.
-            self._require_semidefinite(largest_initial, -initial)
-            weight_forms, weight_constant = dict[int, np.ndarray](), initial
-        start: np.ndarray | None = weight if initial is None else initial
+            self._require_semidefinite(AffineMatrix(maps=largest_initial, constant=-initial))
+            weight_before = AffineMatrix(maps={}, constant=initial)
+        start: np.ndarray | None = weight if initial is None else initial  # it may couple x and e, as no later P does
         forms: LinearForms | None = None
         # Every step's inequality, from the weight before it to its own.
         for k, (step, layout) in enumerate(zip(steps, layouts, strict=True)):
@@ -264,11 +276,12 @@ class HorizonProblem:
             is_like_last = forms is not None and layout.gain is None and all(map(np.array_equal, step, steps[k - 1]))
             if forms is None or not is_like_last:
                 forms = make_linear_forms(step, layout)
-            self._add_step(k, step, forms, weight_forms, weight_constant, start)
+            self._add_step(k, step, forms, weight_before, start)
+            # The multipliers are the last unknowns of a step.
             multipliers = self.unknowns[self.slices[k + 1]][layout.size - layout.multipliers :]
             self.constraints.append(multipliers >= 0)
             # The weight before the next step is an unknown of this one.
-            weight_forms, weight_constant, start = {k + 1: forms.weight}, np.zeros_like(weight), None
+            weight_before, start = AffineMatrix(maps={k + 1: forms.weight}, constant=np.zeros_like(weight)), None
         level_squared = self.unknowns[0]
         self.problem = cp.Problem(cp.Minimize(level_squared), self.constraints)
 
@@ -277,8 +290,7 @@ class HorizonProblem:
         k: int,
         step: StepMatrices,
         forms: LinearForms,
-        weight_forms: dict[int, np.ndarray],
-        weight_constant: Float[np.ndarray, "w w"],
+        weight_before: AffineMatrix,
         start: Float[np.ndarray, "w w"] | None,
     ) -> None:
         """Add the inequality -Phi >= MARGIN level^2 of step k, and that its positive matrices are positive.
@@ -294,41 +306,40 @@ class HorizonProblem:
                 slice k + 1.
             step: its matrices in scaled coordinates: `target` M'M, `energy` of (v, rho).
             forms: matrices of the step as linear maps of its unknowns, each matrix written row by row.
-            weight_forms: {slice: P, the weight before the step, as a linear map of its unknowns}.
-            weight_constant: the part of P without unknowns.
+            weight_before: P, the weight before the step, by the unknowns.
             start: an initial weight that may couple x and e, at the first step; else None.
         """
-        q, width = len(step.energy), len(weight_constant)
+        q, width = len(step.energy), len(weight_before.constant)
         # The part of -Phi without unknowns: P's constant part - M'M.
         constant = -step.target
-        constant[:width, :width] += weight_constant
+        constant[:width, :width] += weight_before.constant
         # Phi is block-diagonal after a permutation, and small blocks are solved faster. `block`: indices in eta of one
         # block; `entries`: of its entries in the matrix (q, q) written row by row.
         for block in find_independent_parts(step, forms, start):
             entries = (block[:, None] * q + block).ravel()
             # -Phi as a linear map of the unknowns of each slice: of the level squared, this step's, and those of P.
             maps = {0: (step.energy - MARGIN * np.eye(q)).ravel()[entries][:, None], k + 1: -forms.next[entries]}
-            for i, form in weight_forms.items():
+            for i, form in weight_before.maps.items():
                 padded = np.zeros((q, q, form.shape[1]))
                 padded[:width, :width] = form.reshape(width, width, -1)
                 maps[i] = maps.get(i, 0.0) + padded.reshape(q * q, -1)[entries]
-            self._require_semidefinite(maps, constant[np.ix_(block, block)])
-        # Matrices of the unknowns that must be positive.
+            self._require_semidefinite(AffineMatrix(maps, constant[np.ix_(block, block)]))
+        # Matrices of the unknowns that must be positive, by MARGIN level^2.
         for form in forms.positive:
             size = math.isqrt(len(form))
-            self._require_semidefinite(
-                {0: -MARGIN * np.eye(size).ravel()[:, None], k + 1: form}, np.zeros((size, size))
-            )
+            maps = {0: -MARGIN * np.eye(size).ravel()[:, None], k + 1: form}
+            self._require_semidefinite(AffineMatrix(maps, np.zeros((size, size))))
 
-    def _require_semidefinite(self, maps: dict[int, np.ndarray], constant: np.ndarray) -> None:
-        """Require sum_i maps_i (unknowns of slice i) + constant, a matrix row by row, to be positive semidefinite.
+    def _require_semidefinite(self, affine: AffineMatrix) -> None:
+        """Add the constraint that a matrix, affine in the unknowns, is positive semidefinite.
 
-        `maps` has the matrix of each slice of unknowns, of which `self.slices` says where they lie in the vector of
-        all.
+        `self.slices` says where the unknowns of each slice lie in the vector of all.
         """
-        # One sparse matrix maps the vector of all unknowns to the sum.
+        constant = affine.constant
+        # One sparse matrix maps the vector of all unknowns to the matrix, row by row: entries side by side, each with
+        # its row, and its column moved to where the slice begins.
         values, rows, columns = [], [], []
-        for i, matrix_of_map in maps.items():
+        for i, matrix_of_map in affine.maps.items():
             map_rows, map_columns = np.nonzero(matrix_of_map)
             values.append(matrix_of_map[map_rows, map_columns])
             rows.append(map_rows)

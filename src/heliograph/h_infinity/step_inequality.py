@@ -83,9 +83,9 @@ def complete_multipliers(
     With `separate` the result is (steps, 4) for f, f~, h, h~. Otherwise (f, f~) share one, and (h, h~) too: (steps, 2).
     """
     multipliers_by_function = 2 if separate else 1
-    is_present = [
-        not growth.absent for growth in (system.growth, system.output_growth) for _ in range(multipliers_by_function)
-    ]
+    is_present = list[bool]()
+    for growth in (system.growth, system.output_growth):
+        is_present += [not growth.absent] * multipliers_by_function
     multipliers = np.zeros((*found.shape[:-1], len(is_present)))
     multipliers[..., is_present] = found
     return multipliers
@@ -94,12 +94,17 @@ def complete_multipliers(
 def _make_step_matrices(
     system: GrowthSystem, k: int, spreads: Float[np.ndarray, "spreads m _"], separate: bool
 ) -> StepMatrices:
-    """Return the matrices of step k over eta = (x, e, f, f~, h, h~, v, rho), without functions that are absent.
+    """Return the matrices of step k over eta = (x, e, f, f~, h, h~, v, rho), all that the step depends on.
 
-    An H-infinity filter bounds the error energy by level^2 times the energy of the disturbances. Its inequality at step
-    k is a quadratic form in eta = (x, e, f, f~, h, h~, v, rho): state x, error e, nonlinear functions f and h with
-    their differences f~ and h~ between state and estimate, disturbances v and rho. Parts of functions that are absent
-    are left out.
+    eta holds the state x, the error e = x - xhat, the nonlinear functions f(x) and h(x), their differences
+    f~ = f(x) - f(xhat) and h~ = h(x) - h(xhat), and the disturbances v and rho. Functions that are zero at all steps
+    are left out. An H-infinity filter bounds the energy of M e by level^2 times that of the disturbances; its condition
+    at step k is a quadratic form in eta, which these matrices make:
+
+      x+ = A x + f + B v,   e+ = A e + f~ + B v - K (what is received less its prediction),
+      received = G (C x + h + D v) + N rho with random (G, N),   its prediction E[G] (C xhat + h(xhat)).
+
+    No gain is chosen yet: the nominal gain of the result is 0 (`scale_steps` sets it).
 
     Args:
         system: x+ = A x + f(x) + B v, what is received G (C x + h(x) + D v) + N rho, and the target M e.
@@ -113,7 +118,9 @@ def _make_step_matrices(
     n, y, m, link = system.states, system.output.shape[1], system.received, system.channel[k]
     # Slices of the parts in eta, which has q entries. Of an absent f or h no columns are used.
     eta = _locate_parts_of_eta(system, k)
-    q, of_f, of_h = eta.rho.stop, slice(0, eta.f.stop - eta.f.start), slice(0, eta.h.stop - eta.h.start)
+    q = eta.rho.stop
+    of_f = slice(0, eta.f.stop - eta.f.start)  # columns of a matrix that multiplies f: all n, or none
+    of_h = slice(0, eta.h.stop - eta.h.start)
     # State x+ = A x + f + B v, and error e+ = A e + f~ + B v before the correction.
     state, error = np.zeros((n, q)), np.zeros((n, q))
     state[:, eta.x], state[:, eta.f], state[:, eta.v] = A, np.eye(n)[:, of_f], B
@@ -189,6 +196,7 @@ def _list_growth_forms(
         pairs_of_conditions.append(
             [(eta.h, eta.x, output_growth.state[k]), (eta.h_error, eta.e, output_growth.error[k])]
         )
+    # Conditions that share a multiplier: each by itself, or a function with its difference.
     groups = [[condition] for pair in pairs_of_conditions for condition in pair] if separate else pairs_of_conditions
     q = eta.rho.stop
     return np.array([_make_growth_form(q, group) for group in groups]).reshape(-1, q)
@@ -306,21 +314,23 @@ def make_linear_forms(step: StepMatrices, layout: UnknownsLayout) -> LinearForms
     or P2 > 0 if the gain K is given. `weight` is diag(P1, P2). All are linear: column i of a map is the matrix at unit
     vector i. `layout`: where each unknown stands in the vector.
     """
+    # The unknowns at each unit vector: the values of a linear map there are its columns.
     units = [layout.unpack(unit) for unit in np.eye(layout.size)]
-    forward = np.array([compute_next_energy(step, unit).ravel() for unit in units]).T
-    state_form = np.array([unit.state.ravel() for unit in units]).T
-    if layout.gain is None:
+    next_form = np.array([compute_next_energy(step, unit).ravel() for unit in units]).T
+    state_form = np.array([unit.state.ravel() for unit in units]).T  # P1
+    if layout.gain is None:  # [[Z, Y'], [Y, P2]]
         blocks = [np.block([[unit.gain_square, unit.product.T], [unit.product, unit.error]]) for unit in units]
-    else:
+    else:  # P2
         blocks = [unit.error for unit in units]
     error_form = np.array([block.ravel() for block in blocks]).T
-    return LinearForms(forward, (state_form, error_form), make_weight_form(layout))
+    return LinearForms(next_form, (state_form, error_form), make_weight_form(layout))
 
 
 def make_weight_form(layout: UnknownsLayout) -> Float[np.ndarray, "ww size"]:
     """Return the linear map from the vector of unknowns to diag(P1, P2), written row by row.
 
-    P1, P2: weights of state and error after the step.
+    P1 and P2 are the weights of state and error after the step. `layout` says where they stand in the vector. A linear
+    map's columns are its values at the unit vectors.
     """
     units = [layout.unpack(unit) for unit in np.eye(layout.size)]
     first_block, second_block = np.diag([1.0, 0.0]), np.diag([0.0, 1.0])
@@ -333,8 +343,14 @@ def find_independent_parts(
 ) -> list[Int[np.ndarray, "_"]]:
     """Return sets of indices of eta between which all entries of Phi are zero, whatever the unknowns are.
 
-    So Phi < 0 splits into a smaller inequality for each set. Phi (q, q) is the matrix of the step's inequality in eta,
-    which begins with x and e of n components each. `start` is the weight before the step if it is not diag(P1, P2).
+    So Phi < 0 splits into a smaller inequality for each set, which a solver solves faster. They are the connected parts
+    of the graph of Phi's entries that may not be zero. Phi (q, q) is the matrix of the step's inequality in eta, which
+    begins with x and e of n components each.
+
+    Args:
+        step: matrices of the step.
+        forms: Phi's part that is linear in the unknowns, `forms.next`.
+        start: the weight before the step if it is not diag(P1, P2).
     """
     q = len(step.energy)
     are_coupled = np.any(forms.next != 0, axis=1).reshape(q, q) | (step.target != 0) | (step.energy != 0)

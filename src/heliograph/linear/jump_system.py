@@ -31,14 +31,22 @@ def mix_moments_of_modes(chain: Float[Array, "*time M M"], moments: Float[Array,
     first row of T is used, the probabilities of the next modes.
     """
     *axes, modes, n, _ = moments.shape
-    sums = chain[..., :modes, :].swapaxes(-1, -2) @ moments.reshape(*axes, modes, n * n)
+    # As one matrix product: row i holds the n^2 entries of X_i, and Y = T' X.
+    used_chain = chain[..., :modes, :]
+    sums = used_chain.swapaxes(-1, -2) @ moments.reshape(*axes, modes, n * n)
     return sums.reshape(*axes, -1, n, n)
 
 
 def propagate_by_mode(maps: Any, moments: Float[Array, "..."], added: Array | float) -> Any:
-    """Propagate second moments of each mode over a linear step, X+ = F X F' + S, of a symmetric X.
+    """Return F X F' + S: second moments X of a state, propagated over a linear step; all arrays may be stacks of them.
 
-    F X F' = F (F X)', so that F is only ever multiplied from the left: it may be sparse, or structured with an `@`.
+    For a symmetric X, F X F' = F (F X)', so that F is only ever multiplied from the left: it may be sparse, or a
+    structured matrix with an `@`.
+
+    Args:
+        maps: F, a matrix (..., p, n).
+        moments: X (..., n, n), symmetric.
+        added: S (..., p, p), such as the covariance of the noise; 0 for none.
     """
     return maps @ (maps @ moments).swapaxes(-1, -2) + added
 
@@ -63,13 +71,16 @@ class JumpSystem(NamedTuple):
     added: Array
 
     def step(self, moments: Float[Array, "*axes _ n n"]) -> Any:
-        """Propagate X over one step, whose fields have no axis of time; with that axis, each step from its own X."""
+        """Return X+ from X over one step, if the fields have no axis of time; with one, X+ of each step from its own X.
+
+        X+_j = F_j (sum_i T_ij X_i) F_j' + S_j.
+        """
         return propagate_by_mode(self.maps, mix_moments_of_modes(self.chain, moments), self.added)
 
     def after(self, moments: Float[Array, "*axes _ n n"]) -> list[Any]:
         """Return the moments X by mode after each step, propagated from those before the first one (M, n, n)."""
         steps = []
-        for fields in zip(*self, strict=True):
+        for fields in zip(*self, strict=True):  # T, F and S of one step, without the axis of time
             moments = JumpSystem(*fields).step(moments)
             steps.append(moments)
         return steps
@@ -88,19 +99,24 @@ class JumpSystem(NamedTuple):
     def operator(self) -> Float[np.ndarray, "e e"]:
         """Return the matrix that takes X before the first step to X after the last, without noise.
 
-        It acts on the e entries of the upper triangles of all modes' moments X.
+        X_j = E[zeta zeta' 1{mode j}] is the second moment of the state in mode j. The matrix acts on the e entries of
+        the upper triangles of all modes' moments.
         """
         without_noise = self._replace(added=0.0 * self.added)
         return np.asarray(make_matrix_on_triangle_entries(without_noise._propagate_one_period, self.shape))
 
     def radius(self) -> float:
-        """Return the spectral radius of the operator: below 1, X stays bounded over steps that repeat for ever."""
+        """Return the spectral radius of `operator`, which takes X over all steps.
+
+        Below 1, X stays bounded if the steps repeat for ever; above 1, it grows without limit.
+        """
         return spectral_radius(self.operator())
 
     def steady(self) -> Any:
         """Return the steady moments X (time, M, n, n) by mode after each of the steps, which repeat for ever.
 
-        The spectral radius of their operator has to be below 1; else there are no steady moments.
+        X_j = E[zeta zeta' 1{mode j}] is the second moment of the state in mode j. The spectral radius of the steps'
+        `operator` has to be below 1; else there are no steady moments.
         """
         # X after a period is L(X) + C, with X the moments before it. Steady moments solve X = L(X) + C.
         without_noise = self._replace(added=0.0 * self.added)
@@ -134,7 +150,9 @@ class JumpSystem(NamedTuple):
             for chain, maps, weight in zip(self.chain[::-1], self.maps[::-1], weights[::-1], strict=True):
                 derivative = weight + later  # by X after this step
                 derivatives.append(derivative)
-                later = mix_moments_of_modes(chain.T, propagate_by_mode(maps.swapaxes(-1, -2), derivative, 0.0))
+                # By X_i before it: sum_j T_ij F_j' (derivative by X_j) F_j.
+                by_mode = propagate_by_mode(maps.swapaxes(-1, -2), derivative, 0.0)
+                later = mix_moments_of_modes(chain.T, by_mode)
             return later[..., :modes_before, :, :], derivatives[::-1]
 
         later = np.zeros((modes_before, n, n))
@@ -148,7 +166,7 @@ class JumpSystem(NamedTuple):
         return np.asarray(by_step + by_step.swapaxes(-1, -2)) / 2  # symmetric, as rounding left it nearly
 
     def _propagate_one_period(self, moments: Array) -> Any:
-        """Propagate X from before the first step to after the last, so that the next period can begin with it.
+        """Return X after the last step, from X before the first, in the form in which the next period begins with it.
 
         If `moments` has a single X (the first step of a period draws its mode anew), the result is summed over the
         modes to a single X too.
@@ -163,8 +181,9 @@ def make_matrix_on_triangle_entries(linear: Maps, shape: tuple[int, ...]) -> Flo
     Column k is the map's result for the k-th unit matrix, which has an entry and its mirror image at 1, all others at
     0.
     """
-    _, where, basis = _place_in_upper_triangles(shape)
-    matrix: Array = linear(basis)[:, *where].T
+    triangles = _place_in_upper_triangles(shape)
+    results = linear(triangles.unit_matrices)  # (e, ..., n, n), one for each unit matrix
+    matrix: Array = results[:, *triangles.entry_indices].T
     return matrix
 
 
@@ -174,28 +193,41 @@ def solve_fixed_point(linear: Maps, constant: Array) -> Any:
     The entries of the upper triangles, which determine a symmetric matrix, are the unknowns of linear equations.
     """
     matrix = make_matrix_on_triangle_entries(linear, constant.shape)
-    _, triangle_indices, _ = _place_in_upper_triangles(constant.shape)
-    entries = library(matrix, constant).linalg.solve(np.eye(len(matrix)) - matrix, constant[triangle_indices])
+    constant_entries = constant[_place_in_upper_triangles(constant.shape).entry_indices]
+    entries = library(matrix, constant).linalg.solve(np.eye(len(matrix)) - matrix, constant_entries)
     return unpack_triangle_entries(entries, constant.shape)
 
 
 def unpack_triangle_entries(entries: Float[Array, "e"], shape: tuple[int, ...]) -> Any:
-    """Return symmetric matrices with these entries in their upper triangles."""
-    return entries[_place_in_upper_triangles(shape)[0]]
+    """Return the symmetric matrices of a shape (..., n, n) that have these entries in their upper triangles.
+
+    `entries` are in the order of rows. It is the inverse of reading them off with `TrianglePlaces.entry_indices`.
+    """
+    return entries[_place_in_upper_triangles(shape).index_in_list]
+
+
+class TrianglePlaces(NamedTuple):
+    """How symmetric matrices of a shape (..., n, n) are built from the list of their upper triangles' e entries.
+
+    Args:
+        index_in_list: for each number of the matrices, its index in the list (..., n, n).
+        entry_indices: the indices of the list's entries in the matrices, one array (e,) for each axis.
+        unit_matrices: for each entry of the list, matrices that are 1 at the entry and at its mirror image, else 0
+            (e, ..., n, n).
+    """
+
+    index_in_list: Int[np.ndarray, "..."]
+    entry_indices: tuple[np.ndarray, ...]
+    unit_matrices: np.ndarray
 
 
 @lru_cache(8)
-def _place_in_upper_triangles(
-    shape: tuple[int, ...],
-) -> tuple[Int[np.ndarray, "..."], tuple[np.ndarray, ...], np.ndarray]:
-    """Return how symmetric matrices of a shape (..., n, n) are built from the list of their upper triangles' entries.
-
-    The results are: for each number of the matrix its index in the list, the indices of the list's entries in the
-    matrix, and for each entry of the list a unit matrix, 1 at the entry and at its mirror image and 0 elsewhere.
-    """
+def _place_in_upper_triangles(shape: tuple[int, ...]) -> TrianglePlaces:
+    """Return where the entries of the upper triangles stand in symmetric matrices of a shape (..., n, n)."""
     *leading, rows, columns = triangle_indices = np.nonzero(np.triu(np.ones(shape)))
     mirrored_indices = *leading, columns, rows
     count = len(rows)
-    indices = np.empty(shape, dtype=int)
-    indices[triangle_indices] = indices[mirrored_indices] = np.arange(count)
-    return indices, triangle_indices, np.eye(count)[:, indices]
+    index_in_list = np.empty(shape, dtype=int)
+    index_in_list[triangle_indices] = index_in_list[mirrored_indices] = np.arange(count)
+    unit_matrices = np.eye(count)[:, index_in_list]
+    return TrianglePlaces(index_in_list, triangle_indices, unit_matrices)

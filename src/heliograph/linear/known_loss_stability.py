@@ -31,9 +31,17 @@ ModeCovariances = Float[np.ndarray, "modes n n"]
 class KnownLossSystem(NamedTuple):
     """Linear plant x+ = A x + w, Cov(w) = Q, behind links with modes i; the receiver knows their kind s = known[i].
 
-    It receives C_s x + v, Cov(v) = R_i. `chain[i, j]` = P(next mode j | now i), `law` is the modes' law in the long
-    run.
-    The receiver cannot distinguish modes of one kind, so a gain belongs to a kind. A kind without rows is a loss.
+    It receives C_s x + v, Cov(v) = R_i. The receiver cannot distinguish modes of one kind, so a gain belongs to a kind.
+    A kind whose C_s has no rows is a loss.
+
+    Args:
+        transition: A (n, n).
+        process: Q (n, n).
+        chain: `chain[i, j]` = P(next mode j | now i).
+        law: probability of each mode in the long run.
+        known: the kind of each mode.
+        outputs: C_s of each kind.
+        noises: R_i of each mode, of the size of its kind's output.
     """
 
     transition: Float[np.ndarray, "n n"]
@@ -67,7 +75,7 @@ class KnownLossSystem(NamedTuple):
 
         The spectral radius of the closed loop must be below 1, else there is no steady covariance.
         """
-        (V,) = self.close_loop(gains).steady()
+        (V,) = self.close_loop(gains).steady()  # of the only step of the period
         U: ModeCovariances = mix_moments_of_modes(self.chain, V)
         return U
 
@@ -98,10 +106,11 @@ def certify_radius(system: KnownLossSystem, gains: KindGains) -> float:
 def find_gains(system: KnownLossSystem) -> KindGains:
     """Return a gain for each kind of mode s, so that the mean error covariance E P stays bounded and small.
 
-    K_s = A U C_s' (C_s U C_s' + R)^-1, with U and R summed over the modes of the kind. First the best filter's
-    covariance recursion, with mean covariances, runs until its gains converge or keep E P bounded. Then policy
-    iteration, which converges faster, improves the gains. If E P is still not bounded, the gains A C^+ (pseudo-inverse)
-    are tried too: if C shows all of x, A - K C is 0 and no old error remains.
+    The links to the receiver are in a mode, such as arrived or lost, which moves as a Markov chain; the receiver knows
+    its kind and uses the kind's constant gain. K_s = A U C_s' (C_s U C_s' + R)^-1, with U and R summed over the modes
+    of the kind. First the best filter's covariance recursion, with mean covariances, runs until its gains converge or
+    keep E P bounded. Then policy iteration, which converges faster, improves the gains. If E P is still not bounded,
+    the gains A C^+ (pseudo-inverse) are tried too: if C shows all of x, A - K C is 0 and no old error remains.
 
     Source: Sinopoli et al. (2004), Theorem 3 (the modified algebraic Riccati equation); by mode for chains.
     """
@@ -111,7 +120,7 @@ def find_gains(system: KnownLossSystem) -> KindGains:
     gains = _iterate_policy(system, gains)
     if system.close_loop(gains).radius() < BELOW_ONE:
         return gains
-    forgetting_gains = tuple(system.transition @ np.linalg.pinv(c) for c in system.outputs)
+    forgetting_gains = tuple(system.transition @ np.linalg.pinv(c) for c in system.outputs)  # A C^+ of each kind
     return min(gains, forgetting_gains, key=lambda candidate: system.close_loop(candidate).radius())
 
 
@@ -124,7 +133,8 @@ def _iterate_covariances(system: KnownLossSystem) -> KindGains:
     """
     size = float(np.trace(system.process)) or 1.0  # without process noise any size serves
     V: ModeCovariances = system.law[:, None, None] * (system.process + size * np.eye(len(system.transition)))
-    noise, gains = 1.0, _improve_gains(system, V, noise=1.0)  # `noise` scales the covariances of all noises
+    noise = 1.0  # factor of the covariances of all noises
+    gains = _improve_gains(system, V, noise)
     for step in range(1, ITERATIONS + 1):
         (V,) = system.close_loop(gains, noise).after(V)
         growth = np.trace(V.sum(axis=0)) / size
@@ -147,6 +157,7 @@ def _iterate_policy(system: KnownLossSystem, gains: KindGains) -> KindGains:
     covariance, if there is one. Else V is the direction in which covariances grow fastest, and the noises, which such a
     growth makes negligible, are scaled by 1 / NEGLIGIBLE. The iteration ends if the gains get worse, or stay.
     """
+    # The step V -> V+ under these gains, with its eigenvalues and spectral radius.
     jumps = system.close_loop(gains)
     values, vectors = np.linalg.eig(jumps.operator())
     radius = float(np.max(np.abs(values)))
@@ -168,8 +179,8 @@ def _fastest_growing_covariances(shape: tuple[int, ...], values: np.ndarray, vec
     """Return the covariances V (modes, n, n) that a step without noise multiplies by its spectral radius, of trace 1.
 
     `values` and `vectors` are the eigenvalues and eigenvectors of the step V -> V+, which acts on the entries of upper
-    triangles. It maps covariances to covariances, so (Perron and Frobenius) its largest eigenvalue is real, with
-    covariances as eigenvector. A small multiple of I makes them invertible.
+    triangles; `shape` is that of V. It maps covariances to covariances, so (Perron and Frobenius) its largest
+    eigenvalue is real, with covariances as eigenvector. A small multiple of I makes them invertible.
     """
     V = unpack_triangle_entries(np.real(vectors[:, np.argmax(values.real)]), shape)
     return np.asarray(V / np.trace(V.sum(axis=0)) + np.eye(shape[-1]) / NEGLIGIBLE)
@@ -227,10 +238,11 @@ def list_eigenspaces(matrix: Float[np.ndarray, "n n"]) -> list[tuple[complex, np
     Eigenvalues that differ by at most SAME times the matrix's norm count as equal. Singular values up to it are zero.
     """
     results: list[tuple[complex, np.ndarray]] = []
-    tolerance = SAME * max(float(np.linalg.norm(matrix, 2)), 1e-300)
+    tolerance = SAME * max(float(np.linalg.norm(matrix, 2)), 1e-300)  # 1e-300: above 0 for a matrix of zeros
     for value in np.linalg.eigvals(matrix):
         is_new = all(abs(value - other) > tolerance for other, _ in results)
         if value.imag >= 0 and is_new:
+            # Eigenvectors span the null space of A - a I: right singular vectors of (nearly) zero singular values.
             _, singular_values, right = np.linalg.svd(matrix - value * np.eye(len(matrix)))
             dimension = max(int(np.sum(singular_values <= tolerance)), 1)
             results.append((complex(value), right.conj().T[:, -dimension:]))
@@ -247,11 +259,12 @@ def find_fastest_unobserved_mode(
     E P >= eps P(the links stay in the set for l steps) |a|^(2 l) v v'. This grows by |a|^2 times the spectral radius of
     the chain within the set. If every mode observes every eigenvector, the growth is 0.
     """
-    results = [
-        UnobservedGrowth(abs(value) ** 2 * spectral_radius(chain[np.ix_(modes, modes)]), value, modes, vectors)
-        for value, space in list_eigenspaces(matrix)
-        for modes, vectors in _find_unobserving_modes(space, outputs)
-    ]
+    results = list[UnobservedGrowth]()
+    for eigenvalue, space in list_eigenspaces(matrix):
+        for modes, vectors in _find_unobserving_modes(space, outputs):
+            chain_within = chain[np.ix_(modes, modes)]
+            growth = abs(eigenvalue) ** 2 * spectral_radius(chain_within)
+            results.append(UnobservedGrowth(growth, eigenvalue, modes, vectors))
     no_growth = UnobservedGrowth(0.0, 0j, (), np.zeros((len(matrix), 0)))
     return max(results, key=lambda found: found.growth, default=no_growth)
 
@@ -284,8 +297,8 @@ def _list_modes_not_observing(space: np.ndarray, outputs: Sequence[np.ndarray]) 
 def _find_unobservable_part(output: np.ndarray, space: np.ndarray) -> np.ndarray:
     """Return a basis of the part of a subspace that the rows of an output do not observe; `space` is a basis (n, d).
 
-    Rows are divided by their lengths, so that units do not matter. A direction is not observed if its singular value in
-    these rows is at most UNSEEN.
+    It is the null space of C on the subspace. Rows of C = `output` are divided by their lengths, so that units do not
+    matter. A direction is not observed if its singular value in these rows is at most UNSEEN.
     """
     lengths = np.linalg.norm(output, axis=1)
     is_used = lengths > 0
@@ -303,8 +316,10 @@ def is_excited_by_noise(vectors: np.ndarray, matrix: Float[np.ndarray, "n n"], n
     It does if they lie in the controllable subspace, which is spanned by W, A W, A^2 W, ... with A the `matrix` and W
     the covariance of the noise.
     """
-    basis, columns = np.zeros((len(matrix), 0)), noise
+    basis = np.zeros((len(matrix), 0))  # orthonormal, of the subspace so far
+    columns = noise
     for _ in range(len(matrix)):
+        # The basis with the next columns, which are scaled to the size 1 of the basis vectors.
         size = np.linalg.norm(columns, 2) if columns.size else 0.0
         if size == 0:
             break

@@ -36,6 +36,8 @@ class LiftedMap:
         is_stored = not varies and rows * columns <= STORED_ENTRIES
         self.moment_matrix = np.asarray(route.moments(2 * degree).matrix) if is_stored else None
         self.moment_degrees = degrees(route.inputs, 2 * degree)
+        # Exponents of each output in each monomial of z; the last column, of the constant 1, is left out. A monomial
+        # has known gains if no output with a random gain is a factor of it.
         exponents = np.array(list_exponents(route.outputs + 1, degree))[:, :-1]
         has_known_gains = ~np.any(exponents[:, ~route.known_gains], axis=1)
         deviation_degrees = degrees(route.outputs, degree) - has_known_gains
@@ -44,7 +46,7 @@ class LiftedMap:
         self.highest_degree[~has_known_gains[:, None] & ~has_known_gains] = 2 * degree
 
     def push_moments(self, moments: Float[Array, "M"]) -> Float[np.ndarray, "L"]:
-        """Return E[monomials of z] from E[monomials of y], both up to twice the degree."""
+        """Return E[monomials of z] from `moments`, E[monomials of y], both up to twice the degree of the lift."""
         with np.errstate(over="ignore", invalid="ignore"):  # the caller refuses what overflows
             if self.moment_matrix is not None:
                 return np.asarray(self.moment_matrix @ np.asarray(moments))
@@ -58,11 +60,12 @@ class LiftedMap:
         `moments` are those of y up to twice the degree. Entry (i, j) needs those up to `highest_degree`[i, j]: higher
         ones cancel in the difference, and would cost digits, so they are set to 0.
         """
-        n, m, shape = self.route.inputs + 1, self.route.outputs + 1, self.highest_degree.shape
-        K, covariance, rounding = self.matrix, np.zeros(shape), np.zeros(len(self.highest_degree))
+        n, m = self.route.inputs + 1, self.route.outputs + 1  # with the constant 1
+        K = self.matrix
+        covariance, rounding = np.zeros(self.highest_degree.shape), np.zeros(len(self.highest_degree))
         for highest in range(int(self.highest_degree.max()) + 1):
             entries = self.highest_degree == highest  # entries that need moments of y up to this degree
-            if not entries[:-1, :-1].any():
+            if not entries[:-1, :-1].any():  # the last row and column are of the constant 1
                 continue
             needed = np.where(self.moment_degrees <= highest, np.asarray(moments), 0.0)
             second_of_y = np.asarray(products_of_monomials(needed, n, self.degree))
@@ -93,8 +96,13 @@ def split_homogeneous(
 
 
 def make_linear_rows(variables: int, degree: int, expected: int | None = None) -> Float[np.ndarray, "wanted monomials"]:
-    """Return rows that read the first `expected` variables off their C(variables + degree, degree) - 1 monomials."""
-    # Monomials are products of `degree` factors of (variables, 1). Variable i itself is x_i times 1^(degree - 1).
+    """Return the matrix that reads variables off the vector of all their monomials of degree 1 to `degree`.
+
+    It has one row for each of the first `expected` variables (all, if None), with a single 1 in the column of the
+    monomial that is the variable itself.
+    """
+    # Monomials are products of `degree` factors of (variables, 1). Variable i itself is x_i times 1^(degree - 1). The
+    # last monomial, 1^degree, is the constant, which is not among the columns.
     column_of_monomial = {powers: i for i, powers in enumerate(list_exponents(variables + 1, degree))}
     rows = np.zeros((variables if expected is None else expected, len(column_of_monomial) - 1))
     for i, row in enumerate(rows):

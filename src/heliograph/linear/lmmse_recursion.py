@@ -54,6 +54,12 @@ class CarriedRounding(NamedTuple):
         D and R are the roundings of Cov(w) and Cov(v), both diagonal. G is the gain, and F = (I - G C) A. The roundings
         change the gain too, but that adds nothing to first order, since the gain minimises the covariance. The largest
         share that X has had of a claimed variance is kept, with its step.
+
+        Args:
+            system: y+ = A y + a + w, z = C y+ + c + v, with the roundings of Cov(w) and Cov(v) at each step.
+            k: the step.
+            matrices: A, C and so on of this step.
+            gains: the filter's gain and claimed covariance at this step.
         """
         I_GC = np.eye(len(gains.gain)) - gains.gain @ matrices.output
         rounding = gains.transition @ self.covariance @ gains.transition.T
@@ -63,14 +69,17 @@ class CarriedRounding(NamedTuple):
         variance = np.diag(system.projection @ rounding @ system.projection.T)
         claimed_variance = np.maximum(np.diag(gains.covariance), variance)
         shares = np.divide(variance, claimed_variance, out=np.zeros_like(variance), where=variance > 0)
-        worst, when = max((self.worst, self.when), (float(np.max(shares, initial=0.0)), k))
-        return CarriedRounding(rounding, worst, when)
+        largest_share = float(np.max(shares, initial=0.0))
+        if largest_share >= self.worst:
+            return CarriedRounding(rounding, worst=largest_share, when=k)
+        return CarriedRounding(rounding, self.worst, self.when)
 
 
 def find_noise_roots(matrices: Steps, size: Float[np.ndarray, " N"]) -> NoiseRoots:
     """Return roots of Cov(w) and Cov(v), with the rounding of a state y whose E[y_i^2] is `size` (N,) joined to them.
 
-    A measurement z = C y + c + v is rounded by its size, at most |C| sqrt(size).
+    Rounding counts as a further noise, so that no less is claimed than the computation gives. A measurement z = C y + c
+    + v is rounded by its size, at most |C| sqrt(size). `matrices` are those of a step, C, Cov(w) and Cov(v) among them.
     """
     received_size = (np.abs(matrices.output) @ np.sqrt(size)) ** 2
     return NoiseRoots(_root_with_rounding(matrices.process, size), _root_with_rounding(matrices.noise, received_size))
@@ -81,14 +90,15 @@ def _root_with_rounding(covariance: Float[np.ndarray, "n n"], seconds: Float[np.
 
     `seconds` are the second moments (n,) of the numbers to which the noise is added, since the sums are rounded.
     """
-    rounding = rounding_of(seconds + np.maximum(np.diag(covariance), 0.0))
+    rounding = rounding_of(seconds + np.maximum(np.diag(covariance), 0.0))  # matrix diag(weights) matrix'
     return np.concatenate([roots_of(covariance), rounding.matrix * np.sqrt(rounding.weights)], axis=1)
 
 
 def step_covariance_roots(root: Float[np.ndarray, "N _"], matrices: Steps, noises: NoiseRoots) -> RecursionStep:
     """Return the gain G and roots of P- and P, given a root of P before: one step of Kalman's recursion.
 
-    P- = A P A' + Cov(w), O = C P- C' + Cov(v), G = P- C' O^-1, P = P- - G C P-. O may be singular (products of a
+    P- = A P A' + Cov(w), O = C P- C' + Cov(v), G = P- C' O^-1, P = P- - G C P-, with A and C of the step's `matrices`.
+    A root W of P is a matrix with W W' = P; by roots half as many digits are lost. O may be singular (products of a
     measurement with few values repeat): what repeats has the gain zero. `noises` are roots of Cov(w) and Cov(v).
     """
     predicted = np.concatenate([matrices.transition @ root, noises.process], axis=1)
@@ -113,26 +123,29 @@ def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
     Source: Kalman (1960), with the second moments of random coefficients in the noises.
     """
     instance("system", system, LinearSystem, "a LinearSystem")
-    root, gains_by_step = roots_of(system.covariance), list[Gains]()
+    root = roots_of(system.covariance)  # of P, the error covariance: P = root root'
+    gains_by_step = list[Gains]()
     # E[y_i^2] at the start, by whose size the noises' rounding is judged.
     second_moments = system.mean**2 + np.diag(system.covariance)
     noises = find_noise_roots(system.step(0), second_moments)
     rounding = CarriedRounding(covariance=np.diag(system.start_rounding), worst=0.0, when=0)
-    steady_from, before = system.steady_from, None  # before: the covariance, as it was SPAN steps ago
+    steady_from = system.steady_from  # from this step on all steps of the system are equal
+    earlier: Pair | None = None  # P and its rounding SPAN steps ago
     for k in range(system.horizon):
-        # From `steady_from` on all steps of the system are the same. There, every SPAN steps, test whether the error
-        # covariance has converged: then all later gains are the last ones, to rounding.
+        # Where the system is steady, test every SPAN steps whether the error covariance has converged: then all later
+        # gains are the last ones, to rounding.
         if k > steady_from and (k - steady_from) % SPAN == 0:
             now = covariance_of_root(root), rounding.covariance
-            if before is not None and _has_converged(now, before, gains_by_step[-1].transition):
+            if earlier is not None and _has_converged(now, earlier, gains_by_step[-1].transition):
                 break
-            before = now
+            earlier = now
         matrices = system.step(k)
         if 0 < k <= steady_from:  # later steps have the noises of step `steady_from`
             noises = find_noise_roots(matrices, second_moments)
         # P- = A P A' + Q, S = C P- C' + R, K = P- C' S^-1, P = P- - K S K', by roots; then the rounding that P carries.
         covariances = step_covariance_roots(root, matrices, noises)
-        gains, root = _make_gains(system, matrices, covariances), covariances.root
+        gains = _make_gains(system, matrices, covariances)
+        root = covariances.root
         rounding = rounding.after_step(system, k, matrices, gains)
         gains_by_step.append(gains)
     over_time = Gains(*(repeat_last_step(values, system.horizon) for values in zip(*gains_by_step, strict=True)))
@@ -187,21 +200,21 @@ def _has_converged(after: Pair, before: Pair, loop: Float[np.ndarray, "N N"]) ->
     return True
 
 
-def _lower_unsupported_claim(claim: Claim, lost: float, step: int) -> Claim:
+def _lower_unsupported_claim(claim: Claim, share_of_rounding: float, step: int) -> Claim:
     """Return the claim of a covariance, or warn and lower it to "nominal" if rounding is too large.
 
-    `lost` is the largest share that rounding has of a claimed variance, and `step` is the step where it occurs. A share
-    up to DIGITS_TOLERANCE is accepted.
+    `share_of_rounding` is the largest share that rounding has of a claimed variance, and `step` is the step where it
+    occurs. A share up to DIGITS_TOLERANCE is accepted.
     """
+    if share_of_rounding <= DIGITS_TOLERANCE:
+        return claim
     remedy = "use a shorter horizon, a lower degree, units in which the state is near zero, or linear_filter"
-    if lost > DIGITS_TOLERANCE:
-        warnings.warn(
-            f"lmmse: rounding is {lost:.1g} of a claimed variance at step {step}: the state's own moments have "
-            f"outgrown the error's, so the claim is nominal; {remedy}",
-            stacklevel=3,
-        )
-        return weakest([claim, "nominal"])
-    return claim
+    warnings.warn(
+        f"lmmse: rounding is {share_of_rounding:.1g} of a claimed variance at step {step}: the state's own moments "
+        f"have outgrown the error's, so the claim is nominal; {remedy}",
+        stacklevel=3,
+    )
+    return weakest([claim, "nominal"])
 
 
 def true_covariance(system: LinearSystem, schedule: Schedule) -> Float[np.ndarray, "time q q"]:
@@ -224,14 +237,17 @@ def true_covariance(system: LinearSystem, schedule: Schedule) -> Float[np.ndarra
         got = f"{schedule.horizon} steps of {received_by_schedule} measurements"
         raise fail("schedule", f"{system.horizon} steps of {m} measurements", got)
     # Mean and covariance of (y, s); at the start s is a known number.
-    mean, covariance = np.append(system.mean, schedule.start), np.pad(system.covariance, (0, len(schedule.start)))
+    mean = np.append(system.mean, schedule.start)
+    covariance = np.pad(system.covariance, (0, len(schedule.start)))
     q = len(system.projection)
     covariances = []
     for k in range(system.horizon):
         gains = Gains(*(field[k] for field in schedule.gains))
         mean, covariance = _propagate_errors(system.step(k), gains, system.projection, mean, covariance)
-        # The last q numbers are x - xhat; the others, (y, s), go into the next step.
-        covariances.append(covariance[-q:, -q:] + np.outer(mean[-q:], mean[-q:]))
+        # The last q numbers are the error x - xhat, whose second moment is Cov + mean mean'; the others, (y, s), go
+        # into the next step.
+        error_mean, error_covariance = mean[-q:], covariance[-q:, -q:]
+        covariances.append(error_covariance + np.outer(error_mean, error_mean))
         mean, covariance = mean[:-q], covariance[:-q, :-q]
     return np.array(covariances)
 

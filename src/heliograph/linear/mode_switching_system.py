@@ -54,19 +54,20 @@ def modal_system(
             closed), fewer steps than the horizon.
     """
     n = _find_state_size(move, measure)
-    # Homogeneous coordinates y~ = (y, 1).
+    # Mean and covariance of the homogeneous coordinates y~ = (y, 1).
     mean = np.append(array("initial mean", initial_mean, (n,)), 1.0)
     initial = np.pad(covariance("initial covariance", initial_covariance, n), ((0, 1), (0, 1)))
     wanted = np.eye(n) if projection is None else array("what is to be known", projection, (None, n))
     pairs = zip(list_checked_steps(move, horizon), list_checked_steps(measure, horizon), strict=True)
     modes_by_step = [joint_modes(Stack(pair)) for pair in pairs]
     # E_i = E[y~ y~' 1{i}] and Cov(y~ 1{i}) at the start, where the chain of the modes has not moved yet.
-    law, chain = np.asarray(modes_by_step[0].initial), np.eye(len(modes_by_step[0].initial))
+    law = np.asarray(modes_by_step[0].initial)
+    chain = np.eye(len(law))
     moments = law[:, None, None] * (np.outer(mean, mean) + initial)
     start = np.kron(np.diag(law), initial) + np.kron(np.diag(law) - np.outer(law, law), np.outer(mean, mean))
     steps = list[Steps]()
     for modes in modes_by_step:
-        # In each mode the map is a pair (move, measure); moments of each.
+        # In each mode the map is a pair (move, measure), a Stack of both; mean and covariance of each one's entries.
         moves, measures = zip(*(m.maps for m in modes.maps if isinstance(m, Stack)), strict=True)
         transition, process, moments = _propagate_modes(_take_moments_by_mode(list(moves)), chain, moments)
         measure_mean, measure_covariance = _take_moments_by_mode(list(measures))
@@ -102,8 +103,12 @@ def _find_state_size(move: Channel, measure: Channel) -> int:
 
 
 def _take_moments_by_mode(maps: list[AbstractRandomAffine]) -> Moments:
-    """Return, for the map y -> G y + n of each mode, E[(G, n)] and the covariances of the entries of (G, n)."""
-    means, covariances = zip(*((m.moments(1).mean[:-1], nominal_covariance(m).center) for m in maps), strict=True)
+    """Return, for the map y -> G y + n of each mode, E[(G, n)] and the covariances of the entries of (G, n).
+
+    `moments(1).mean` is E of the homogeneous matrix [G, n; 0, 1], whose last row is dropped.
+    """
+    means = [affine.moments(1).mean[:-1] for affine in maps]
+    covariances = [nominal_covariance(affine).center for affine in maps]
     return np.array(means), np.array(covariances)
 
 

@@ -1,6 +1,7 @@
 """A linear model lifted to monomials: powers of the state and of the measurement, and modes, as one linear system."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -55,10 +56,12 @@ class SteadyMomentTest:
         decay = 1 - spectral_radius(matrix)
         self._tolerance = -1.0 if varies or decay <= 0 else EPS * decay
         # Moments are E of all products of `order` factors of (x, 1). E[x_i^2] has x_i twice, and the 1 order - 2 times.
-        n, index_of_moment = len(matrix), position(len(matrix) + 1, order)
+        n = len(matrix)
+        index_of_moment = position(n + 1, order)
         self._powers = np.array(list_exponents(n + 1, order))[:, :n]  # exponents of x in each moment
-        self._squares = [index_of_moment[(*(2 * int(i == j) for j in range(n)), order - 2)] for i in range(n)]
-        self._last: Moments | None = None
+        exponents_of_squares = [(*(2 * int(i == j) for j in range(n)), order - 2) for i in range(n)]
+        self._squares = [index_of_moment[exponents] for exponents in exponents_of_squares]  # where E[x_i^2] stand
+        self._last: Moments | None = None  # the moments of the call before
 
     def is_steady(self, moments: Moments) -> bool:
         """Return whether the moments equal those of the previous call up to rounding; False at the first call."""
@@ -102,7 +105,8 @@ def lift_modes(
     distinct = {id(measurement): measurement for measurement in measurements}
     varies = len(distinct) > 1
     lifts_by_id = {i: [LiftedMap(m, degree, varies) for m in measurement.maps] for i, measurement in distinct.items()}
-    matrix_by_id = {i: np.asarray(p.moments(degree).matrix) for i, p in {id(p): p for p in plants}.items()}
+    distinct_plants = {id(plant): plant for plant in plants}
+    matrix_by_id = {i: np.asarray(plant.moments(degree).matrix) for i, plant in distinct_plants.items()}  # M
     # If nothing varies and moments and law are steady, all later steps equal the last one, to rounding. Step 0, in
     # which the chain does not move, is no such step.
     steady = SteadyMomentTest(np.asarray(plants[0].matrix), 2 * degree, varies or len(matrix_by_id) > 1)
@@ -115,9 +119,10 @@ def lift_modes(
             moments = np.asarray(push_moments(plant, 2 * degree, moments))
         check_finite_moments(moments, k, 2 * degree)
         next_second = products_of_monomials(moments, n + 1, degree)
-        matrix, lifts = matrix_by_id[id(plant)], lifts_by_id[id(measurement)]
+        matrix, lifts = matrix_by_id[id(plant)], lifts_by_id[id(measurement)]  # M, and the maps y -> z by mode
         process, law = _compute_noise_and_next_law(law, chain, matrix @ second @ matrix.T, next_second)
         noise, rounding_of_noise = _average_noise(law, lifts, moments)
+        # K_1, K_2, ... side by side, without their last row, that of the constant 1 among the monomials of z.
         output = np.concatenate([lift.matrix for lift in lifts], axis=1)[:-1]
         no_drift, no_offset = np.zeros(len(mean)), np.zeros(len(output))
         steps.append(Steps(np.kron(chain.T, matrix), no_drift, process, output, no_offset, noise))
@@ -156,14 +161,17 @@ def _average_noise(
 
     `law` holds the modes' probabilities p_j, `lifts` each mode's map to monomials Z of z, `moments` those of y.
     """
-    covariances, losses = zip(*(lift.mean_conditional_covariance(moments) for lift in lifts), strict=True)
-    return np.tensordot(law, covariances, axes=1), np.abs(law) @ np.array(losses)
+    covariances, roundings = zip(*(lift.mean_conditional_covariance(moments) for lift in lifts), strict=True)
+    return np.tensordot(law, covariances, axes=1), np.abs(law) @ np.array(roundings)
 
 
 def _keep_if_unchanged(
     law: Float[np.ndarray, " modes"], after: Float[np.ndarray, " modes"]
 ) -> Float[np.ndarray, " modes"]:
-    """Return the law after a step, or the same law as before if both agree to rounding: so a steady one is found."""
+    """Return the law `after` a step, or the law before it if both agree to rounding (4 EPS, relative).
+
+    So a steady law stays the same numbers, and a test for equality finds it.
+    """
     return law if np.allclose(law, after, rtol=4 * EPS, atol=0) else after
 
 
@@ -200,33 +208,38 @@ def lifted_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: 
     moments = initial_monomial_moments(plant_0, 2 * degree)
     assumed = AssumedModel(plant, sensor, channel, order=2 * degree)
     if first(channel).remembers:
-        return with_assumed(_lift_chain(routes, degree, moments, (n, m)), assumed)
+        return with_assumed(_lift_chain(routes, degree, moments, n, m), assumed)
     # Start of the lifted state: E Y_0 and Cov Y_0.
     second = products_of_monomials(moments, n + 1, degree)
     mean, covariance = mean_and_covariance(second)
-    varies = isinstance(plant, OverTime), isinstance(sensor, OverTime) or isinstance(channel, OverTime)
-    steps, process_rounding, received_rounding = _lift_steps(routes, degree, moments, varies)
+    measurement_varies = isinstance(sensor, OverTime) or isinstance(channel, OverTime)
+    lifted = _lift_steps(routes, degree, moments, isinstance(plant, OverTime), measurement_varies)
     system = LinearSystem(
-        steps,
+        lifted.steps,
         mean=mean,
         covariance=covariance,
         projection=make_linear_rows(n, degree),
-        rounding=process_rounding,
-        received_rounding=received_rounding,
+        rounding=lifted.process_rounding,
+        received_rounding=lifted.received_rounding,
         start_rounding=EPS * np.diag(second)[:-1],
     )
     return with_assumed(system, assumed)
 
 
 def _lift_chain(
-    routes: Sequence[PlantAndMeasurementMaps], degree: int, moments: Float[np.ndarray, "M"], sizes: tuple[int, int]
+    routes: Sequence[PlantAndMeasurementMaps], degree: int, moments: Float[np.ndarray, "M"], n: int, m: int
 ) -> LinearSystem:
     """Return the linear system of a channel with memory, whose state is the monomials times the flag of each mode.
 
-    `routes` are the maps of each step, x -> x+ (plant) and x+ -> z (measurement). `moments` are those of x_0 up to
-    twice the degree. `sizes` are the numbers of states and of outputs.
+    A flag is 1 in its mode of the channel and 0 in all others.
+
+    Args:
+        routes: the maps of each step, x -> x+ (plant) and x+ -> z (measurement).
+        degree: largest degree of the monomials.
+        moments: moments of x_0 up to twice the degree.
+        n: number of states.
+        m: number of outputs.
     """
-    n, m = sizes
     distinct = {id(r.measurement): r.measurement for r in routes}  # steps share one object where nothing varies
     modes_by_id = {i: joint_modes(measurement, order=degree) for i, measurement in distinct.items()}
     refuse_lift(degree, n, m, len(routes), modes=max(len(modes.initial) for modes in modes_by_id.values()))
@@ -236,22 +249,37 @@ def _lift_chain(
     return lift_modes([r.plant for r in routes], modes_by_step, degree, moments, projection)
 
 
+class _LiftedSteps(NamedTuple):
+    """Steps of a system of monomials, and the rounding errors of its noises' variances over time.
+
+    process_rounding: of Cov(w), (time, monomials of x). received_rounding: of Cov(v), (time, monomials of z).
+    """
+
+    steps: Steps
+    process_rounding: Float[np.ndarray, "time N"]
+    received_rounding: Float[np.ndarray, "time m"]
+
+
 def _lift_steps(
-    routes: Sequence[PlantAndMeasurementMaps], degree: int, moments: Float[np.ndarray, "M"], varies: tuple[bool, bool]
-) -> tuple[Steps, np.ndarray, np.ndarray]:
+    routes: Sequence[PlantAndMeasurementMaps],
+    degree: int,
+    moments: Float[np.ndarray, "M"],
+    plant_varies: bool,
+    measurement_varies: bool,
+) -> _LiftedSteps:
     """Lift each step to monomials; return the steps, and the rounding errors of both noises' variances over time.
 
     The lifted state has all monomials of x up to the degree: X+ = F X + f + w, Z = H X+ + h + v. The covariances of its
     noises depend on the moments of x before any data, so these are followed too. Once they are steady, all later steps
-    equal the last, to rounding. The roundings are (time, monomials of x) and (time, monomials of z).
+    equal the last, to rounding.
 
     Args:
         routes: the maps of each step, x -> x+ and x+ -> z.
         degree: largest degree of the monomials.
         moments: moments of x_0 up to twice the degree (M,).
-        varies: whether the plant differs between steps, and whether the measurement does.
+        plant_varies: whether the plant differs between steps.
+        measurement_varies: whether the sensor or the channel does.
     """
-    plant_varies, measurement_varies = varies
     steps, roundings = list[Steps](), list[tuple[np.ndarray, np.ndarray]]()
     steady = SteadyMomentTest(np.asarray(routes[0].plant.matrix), 2 * degree, plant_varies or measurement_varies)
     last: PlantAndMeasurementMaps | None = None
@@ -275,7 +303,7 @@ def _lift_steps(
         roundings.append((rounding_of_process, rounding_of_noise))
     over_time = Steps(*(repeat_last_step(values, len(routes)) for values in zip(*steps, strict=True)))
     process_rounding, received_rounding = (repeat_last_step(x, len(routes)) for x in zip(*roundings, strict=True))
-    return over_time, process_rounding, received_rounding
+    return _LiftedSteps(over_time, process_rounding, received_rounding)
 
 
 def _are_identical(left: AbstractRandomAffine, right: AbstractRandomAffine) -> bool:
@@ -284,7 +312,10 @@ def _are_identical(left: AbstractRandomAffine, right: AbstractRandomAffine) -> b
 
 
 def initial_monomial_moments(plant: LinearPlant, order: int) -> Float[np.ndarray, "monomials"]:
-    """Return E[monomials of (x_0, 1)] of this order under the plant's law of x_0, a Gaussian one unless it is given."""
+    """Return E of all monomials of (x_0, 1) of a given order, products of so many factors, under the law of x_0.
+
+    It is the law that the plant holds, or else a Gaussian one.
+    """
     law = plant.deviation if plant.deviation is not None else Gaussian(plant.initial_covariance)
     # x_0 = (initial mean - the law's mean) + a draw of the law, as a homogeneous matrix.
     shift = np.eye(len(plant.states) + 1)
@@ -298,7 +329,8 @@ def refuse_lift(degree: int, states: int, outputs: int, horizon: int, modes: int
     if check_count("degree of the lift", degree) > HIGHEST:
         got = f"{degree}: binomials of twice the degree are no numbers of 64 bits"
         raise fail("degree of the lift", f"at most {HIGHEST}", got)
-    n, m = count_monomials(states + 1, degree), count_monomials(outputs + 1, degree)
+    n, m = count_monomials(states + 1, degree), count_monomials(outputs + 1, degree)  # the constant 1 among them
+    # At each step A and Cov(w), of n modes rows and columns; C; and Cov(v).
     entries = horizon * (2 * (n * modes) ** 2 + n * modes * m + m * m)
     of_modes = f" in {modes} modes" if modes > 1 else ""
     if entries > MEMORY_LIMIT_ENTRIES:

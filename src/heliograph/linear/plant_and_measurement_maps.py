@@ -53,7 +53,15 @@ def make_plant_and_measurement_maps(
 ) -> list[PlantAndMeasurementMaps]:
     """Return the plant's and the measurement's random map of each step; steps that do not vary share one object.
 
-    The noises' moments are tabulated up to `order`. Steps with the same noise share a table.
+    A filter that needs moments of the state and of what arrives takes them from these maps. The noises' moments are
+    tabulated up to `order`; steps with the same noise share a table.
+
+    Args:
+        plant: linear plant, perhaps over time.
+        sensor: linear sensor, perhaps over time.
+        channel: random affine map from the sensor to the filter, perhaps over time.
+        order: highest order of the moments of the noises.
+        horizon: number of steps.
     """
     plants = _tabulate_affine_maps(list_checked_steps(plant, horizon), order)
     sensors, channels = list_checked_steps(sensor, horizon), list_checked_steps(channel, horizon)
@@ -69,7 +77,8 @@ def _make_measurement_maps(
 ) -> list[AbstractRandomAffine]:
     """Return the random map from the state to what is received, z, at each step.
 
-    It is the sensor's map followed by the channel's. If the channel is a sum of links and the sensor's outputs have
+    `sensors` and `channels` are those of each step; noises are tabulated up to the `order` of their moments. The map
+    is is the sensor's map followed by the channel's. If the channel is a sum of links and the sensor's outputs have
     independent noises at all steps, the sensor is moved into each link instead (`move_sensor_into_links`). That gives
     one map of the state itself.
     """

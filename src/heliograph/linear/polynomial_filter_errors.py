@@ -36,9 +36,15 @@ from heliograph.random_affine.series_and_stack import Series, Stack
 def quadratic_system_with_linear_estimate(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, linear: Schedule
 ) -> LinearSystem:
-    """Return the system of all products up to degree 2 of (x, q, z), where q is the estimate of a linear filter.
+    """Return the linear system of all products up to degree 2 of (x, q, z), q the estimate of a linear filter.
 
-    Its measurement is z, z z' and z q' of the present step: components of its state, so without noise of their own.
+    The best linear filter of this system is the best filter of x that is quadratic in each z and may multiply it by q:
+    a quadratic filter with memory of earlier data. `lmmse` gives its gains and its error, before any data. The
+    measurement is z, z z' and z q' of the present step: components of its state, so without noise of their own.
+
+    Method: let Y hold all products up to degree 2 of (x, q, z) and the constant 1. A step is a random affine map of
+    (x, q, z), so E[Y+ | Y] = M Y, with M from moments of the map up to order 2, and the noise Y+ - M Y is white with
+    Cov(w) = E[Y+ Y+'] - M E[Y Y'] M', from moments up to order 4.
 
     Args:
         plant: linear plant without inputs.
@@ -54,7 +60,7 @@ def quadratic_system_with_linear_estimate(
     n, m = len(plant_0.states), int(first(channel).outputs)
     if linear.gains.gain.shape[1:] != (n, m):
         raise fail("linear schedule", f"gains of shape {(n, m)}", f"shape {linear.gains.gain.shape[1:]}")
-    total = 2 * n + m
+    total = 2 * n + m  # numbers in (x, q, z)
     refuse_lift(2, total, m + n, horizon)
     # At the start (x_0, q_0, 0), with a known q_0, is an affine function of x_0. `moments` are up to order 4, and
     # `second` is E[Y Y'] of the products Y up to degree 2.
@@ -62,14 +68,16 @@ def quadratic_system_with_linear_estimate(
     moments = push_through_known_map(start_map, 4, initial_monomial_moments(plant_0, 4))
     second = products_of_monomials(moments, total + 1, 2)
     mean, initial = mean_and_covariance(second)
-    received, cache = _make_received_products(n, m), _MomentCache()
+    received = _make_received_products(n, m)  # selects z, z z' and z q' from Y
+    cache = _MomentCache()
     steps, rounding = list[Steps](), list[np.ndarray]()
     for k, route in enumerate(make_plant_and_measurement_maps(plant, sensor, channel, 4, horizon)):
-        # (x, q, z) -> (x+, q) -> (x+, q, z+) -> (x+, q+, z+).
+        # One step is three maps: (x, q, z) -> (x+, q) by the plant, -> (x+, q, z+) by the measurement, and
+        # -> (x+, q+, z+) by the linear filter.
         move = cache.make_move_map(route.plant, m)
         measure_squares, measure_fourth = cache.make_measurement_moments(route.measurement, n)
         update = _make_filter_map(Gains(*(field[k] for field in linear.gains)))
-        # E[Y+ | Y] = M Y with M = Sym^2(filter) E Sym^2(channel) E Sym^2(plant).
+        # E[Y+ | Y] = M Y. M is the product of the maps' mean matrices on products up to degree 2.
         transition = symmetric_power(update, 2) @ measure_squares @ move.moments(2).matrix
         moments = push_through_known_map(update, 4, measure_fourth @ push_moments(move, 4, moments))
         next_second = products_of_monomials(moments, total + 1, 2)
@@ -86,7 +94,7 @@ def quadratic_system_with_linear_estimate(
 
 
 def _affine_matrix(matrix: Float[np.ndarray, "m n"], offset: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m+1 n+1"]:
-    """Return [[A, a], [0, 1]] of x -> A x + a."""
+    """Return the homogeneous matrix [[A, a], [0, 1]] of x -> A x + a, which maps (x, 1) to (A x + a, 1)."""
     return np.block([[matrix, offset[:, None]], [np.zeros((1, matrix.shape[1])), np.ones((1, 1))]])
 
 
@@ -110,7 +118,7 @@ class _MomentCache:
     """
 
     def __init__(self) -> None:
-        """Start without kept moments: none of a plant's noise, and none of a measurement."""
+        """Begin with an empty cache: no table of a plant's noise, and no moments of a measurement."""
         self.last_plant_noise: AbstractNoise | None = None
         self.joint_noise: AbstractNoise | None = None
         self.last_measurement: AbstractRandomAffine | None = None
@@ -127,8 +135,10 @@ class _MomentCache:
             no_noise = Gaussian(np.zeros((n, n)))
             self.last_plant_noise = plant.noise
             self.joint_noise = TabulatedNoise(Independent([plant.noise, no_noise]), order=4)
+        # [[A, 0, 0], [0, I, 0]] of (x, q, z).
         matrix = np.zeros((2 * n, 2 * n + m))
-        matrix[:n, :n], matrix[n:, n : 2 * n] = plant.matrix, np.eye(n)
+        matrix[:n, :n] = plant.matrix
+        matrix[n:, n : 2 * n] = np.eye(n)
         return GainAndNoise(Constant(1.0), matrix, self.joint_noise)
 
     def make_measurement_moments(self, measurement: AbstractRandomAffine, n: int) -> tuple[np.ndarray, np.ndarray]:
@@ -155,11 +165,13 @@ def _make_received_products(n: int, m: int) -> np.ndarray:
     total = 2 * n + m
     index_of_monomial = {powers: i for i, powers in enumerate(list_exponents(total + 1, 2))}
     # z and z z': exponents of (z, 1) behind zeros for x and q; the last one, of the constant alone, is left out.
-    selected = [(*(0,) * (2 * n), *powers) for powers in list_exponents(m + 1, 2)[:-1]]
+    no_x_and_q = (0,) * (2 * n)
+    selected = [(*no_x_and_q, *powers) for powers in list_exponents(m + 1, 2)[:-1]]
     # z_i q_j: exponent 1 of q_j, variable n + j, and of z_i, variable 2 n + i.
     for i in range(m):
         for j in range(n):
-            selected.append(tuple(int(variable in (n + j, 2 * n + i)) for variable in range(total + 1)))
+            factors = n + j, 2 * n + i
+            selected.append(tuple(int(variable in factors) for variable in range(total + 1)))
     rows = np.zeros((len(selected), len(index_of_monomial) - 1))
     for row, powers in zip(rows, selected, strict=True):
         row[index_of_monomial[powers]] = 1.0
@@ -188,8 +200,13 @@ class GainOverLinear:
 
     def gain(self, degree: int) -> Float[np.ndarray, "n"]:
         """Return the share of the linear filter's error variance that this degree removes, for each state."""
-        mean = {d: np.diagonal(self.covariance[d][self.after :], axis1=1, axis2=2).mean(axis=0) for d in (1, degree)}
-        return np.asarray(1 - mean[degree] / mean[1])
+
+        def average_variances(d: int) -> np.ndarray:
+            """Return the error variance of each state by the filter of degree d, averaged over the steps that count."""
+            variances = np.diagonal(self.covariance[d][self.after :], axis1=1, axis2=2)
+            return np.asarray(variances.mean(axis=0))
+
+        return np.asarray(1 - average_variances(degree) / average_variances(1))
 
     @property
     def symmetric(self) -> bool:
@@ -261,7 +278,7 @@ def skewness(square: LinearSystem, states: int, outputs: int) -> float:
     largest = 0.0
     for k in range(square.horizon):
         step, covariance = square.step(k), state.covariance[k + 1]
-        cross = step.output @ covariance
+        cross = step.output @ covariance  # Cov(products of z, products of x)
         # Joint covariance and mean of (products of x, products of z), and the indices of x and z themselves in it.
         joint = np.block([[covariance, cross.T], [cross, cross @ step.output.T + step.noise]])
         mean = np.concatenate([state.mean[k + 1], step.output @ state.mean[k + 1] + step.offset])
@@ -297,7 +314,7 @@ def _largest_third_moment(
 def _index_products(variables: int) -> dict[tuple[int, ...], int]:
     """Return the positions of y_i, by (i,), and of y_i y_j, by (i, j), i <= j, among the monomials up to degree 2.
 
-    Monomials are those of degree 2 in (y, 1): y_i is y_i times 1.
+    y has so many `variables`. The monomials are those of degree 2 in (y, 1): y_i is y_i times 1.
     """
     index = {powers: i for i, powers in enumerate(list_exponents(variables + 1, 2))}
     unit = np.eye(variables + 1, dtype=int)

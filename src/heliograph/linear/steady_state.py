@@ -192,7 +192,8 @@ def steady_state(plant: AnyPlant, sensor: AnySensor) -> SteadyState:
     Source: Anderson and Moore, Optimal filtering (1979), chapter 4.
     """
     what = "steady state"
-    (a, q), (c, r) = plant_matrices(plant, what), sensor_matrices(sensor, len(first(plant).states), what)
+    a, q = plant_matrices(plant, what)  # F and Q
+    c, r = sensor_matrices(sensor, len(first(plant).states), what)  # H and R
     step = Steps(transition=a, drift=np.zeros(len(a)), process=q, output=c, offset=np.zeros(len(c)), noise=r)
     # P- solves the Riccati equation of the prediction, which is that of control with transposed matrices.
     try:
@@ -213,6 +214,6 @@ def steady_state(plant: AnyPlant, sensor: AnySensor) -> SteadyState:
 
 
 def _make_no_steady_state_error(got: str) -> Exception:
-    """Make the ValueError of a plant and sensor without a steady state."""
+    """Return the ValueError of a plant and sensor without a steady state, to be raised; `got` says what was found."""
     expected = "unstable modes that the sensor sees, and noise in all those on the unit circle"
     return fail("steady state", expected, " ".join(got.split()).rstrip("."))

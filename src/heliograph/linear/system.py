@@ -77,7 +77,11 @@ class LinearSystem(Module):
         received_rounding: Rounding | None = None,
         start_rounding: Rounding | None = None,
     ):
-        """Check all arrays against the numbers of steps, states N and outputs m that `steps` has."""
+        """Check all arrays against the numbers of steps, of states N and of outputs m that `steps` has, and hold them.
+
+        The system is y+ = A y + a + w, z = C y+ + c + v, x = W y; the class says what each argument is. Roundings are
+        zero where None is given.
+        """
         instance("steps of a system", steps, Steps, "Steps")
         time, n = np.shape(steps.drift)
         m = np.shape(steps.offset)[-1]
@@ -104,23 +108,24 @@ class LinearSystem(Module):
     @property
     def steady_from(self) -> int:
         """The first step from which on all steps have the same matrices and roundings; 0 if all steps are equal."""
-        changes = [0]  # the last step at which each field differs from the step before
+        last_changes = [0]  # of each field: the last step at which it differs from the step before
         for field in (*self.steps, self.rounding, self.received_rounding):
             differs = field[1:] != field[:-1]
             step_differs = np.any(differs, axis=tuple(range(1, differs.ndim)))
             differing_steps = 1 + np.flatnonzero(step_differs)
-            changes += differing_steps[-1:].tolist()
-        return max(changes)
+            if len(differing_steps):
+                last_changes.append(int(differing_steps[-1]))
+        return max(last_changes)
 
 
 def repeat_last_step(first_steps: Sequence[np.ndarray], horizon: int) -> np.ndarray:
-    """Stack arrays of the first steps (time, ...), and repeat the last one for all later steps of the horizon."""
+    """Return arrays of the first steps stacked (horizon, ...), the last one repeated for all later steps."""
     values = np.array(first_steps)
     return np.concatenate([values, np.repeat(values[-1:], horizon - len(values), axis=0)])
 
 
 def _rounding_or_zero(rounding: ArrayLike | None, shape: tuple[int, ...]) -> np.ndarray:
-    """Return the rounding as an array of this shape, zeros for None."""
+    """Return rounding errors as an array of this shape, zeros if none are given; raise ValueError for another shape."""
     numbers: np.ndarray = np.zeros(shape) if rounding is None else array("rounding", rounding, shape)
     return numbers
 
@@ -215,15 +220,17 @@ class Schedule(Module):
     )  # models that it was made for
 
     def __init__(self, gains: Gains, start: "Float[ArrayLike, ' N']", claim: Claim):
-        """Check and hold the gains of each step, the filter's state before the first, and the claim.
+        """Check the shapes of all arrays against each other, and hold them.
 
-        A schedule is a linear filter whose gains are known before any data: s+ = F s + K z + f, xhat = L s + J z + d.
+        A schedule is a linear filter whose gains are known before any data: s+ = F s + K z + c, xhat = L s + J z + d,
+        and G s + g is its prediction of z.
 
         Args:
-            gains: F (`transition`), K (`gain`), f (`offset`), L (`output`), J (`direct`), d (`output_offset`), and the
-                covariances, each with a leading axis of time; n numbers in s, m in z and q in xhat.
+            gains: F (`transition`), K (`gain`), c (`offset`), L (`output`), J (`direct`), d (`output_offset`), G
+                (`expected`), g (`expected_offset`), and three covariances, each with a leading axis of time; n numbers
+                in s, m in z and q in xhat.
             start: the filter's state s before the first step (n,).
-            claim: what the covariances are: exact, an upper bound, nominal, or none.
+            claim: what the covariances are: "exact", "upper" (a bound), "nominal" or "none".
         """
         instance("gains of a schedule", gains, Gains, "Gains")
         self.start = array("start of the schedule", start, (None,))
@@ -238,12 +245,12 @@ class Schedule(Module):
         }  # fmt: skip
         checked = {}
         for name, value in gains._asdict().items():
-            check_array = _array_or_nan if name in MAY_BE_NAN else array
+            check_array = _array_or_nan if name in MAY_BE_NAN else array  # these covariances may be unknown
             checked[name] = check_array(f"schedule {name}", value, shape_of_field[name])
         self.gains = Gains(**checked)
         if len(self.start) != n:
             raise fail("start of the schedule", f"shape ({n},)", f"shape {self.start.shape}")
-        if not isinstance(claim, str) or claim not in STRENGTH:
+        if not isinstance(claim, str) or claim not in STRENGTH:  # the four claims
             raise fail("claim", f"one of {list(STRENGTH)}", show_value(claim))
         self.claim = claim
 
@@ -253,13 +260,16 @@ class Schedule(Module):
         return len(self.gains.offset)
 
     def save(self, path: str | Path) -> None:
-        """Write the arrays to a NumPy file (.npz), for another program or another day."""
+        """Write all arrays and the claim to a NumPy file (.npz), which `load_schedule` or another program reads."""
         with open(path, "wb") as file:
             np.savez(file, start=self.start, claim=np.array(self.claim), **self.gains._asdict())
 
 
 def _array_or_nan(name: str, value: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return a value as a checked array of the given shape; NaN stands for unknown numbers, and is kept."""
+    """Return a value as an array, after a check of its shape and numbers; NaN, for an unknown number, is let pass.
+
+    `name` is what an error message calls it.
+    """
     unknown = np.isnan(value)
     checked = array(name, np.where(unknown, 0.0, value), shape)
     return np.where(unknown, np.nan, checked)

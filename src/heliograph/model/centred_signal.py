@@ -54,7 +54,8 @@ def _subtract_reference(channel: AbstractRandomAffine, reference: ArrayLike | Ov
     r = array("reference", library(reference).atleast_1d(reference), (channel.inputs,))
     memoryless = without_memory(channel)
     assert isinstance(memoryless, AbstractRandomAffine)
-    mean_gain = memoryless.moments(1).mean[:-1, :-1]  # E[G], without the offset's row and column
+    homogeneous = memoryless.moments(1).mean  # E of [G, n; 0, 1], which maps (y, 1) to (z, 1)
+    mean_gain = homogeneous[:-1, :-1]  # E[G]
     subtract, add_back = known(np.eye(len(r)), -r), known(np.eye(channel.outputs), mean_gain @ r)
     return amplify_and_forward([subtract, channel, add_back])
 
@@ -103,10 +104,13 @@ def expected_signal(
 
 @compile_on_call
 def _predict_outputs(plant: AnyPlant, sensor: AnySensor, inputs: Float[Array, "horizon inputs"]) -> jax.Array:
-    """Return E[y_k] at each step, with the plant moved by its mean alone under these inputs."""
+    """Return h(x_k) + E v at each step, with x_0 = E x_0 and x_k+1 = f(x_k, u_k) + E w under the given inputs.
+
+    It is E[y_k] of the sensor's signal where plant and sensor are linear.
+    """
 
     def step(x: jax.Array, row: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        """Move the state's mean x over step k with inputs u; return it with the mean of the measurement there."""
+        """Return the state's mean after step k, to go on with, and the measurement's mean there; row: (k, inputs u)."""
         k, u = row
         plant_k, sensor_k = at(plant, k), at(sensor, k)
         x = plant_k.transition(x, u) + plant_k.noise_mean()

@@ -202,7 +202,7 @@ def dropout(channel: AbstractRandomAffine, arrival: ArrayLike, radius: ArrayLike
     p = scalar("arrival probability", arrival, 0.0, 1.0)
 
     def mix_with_zero(links: Sequence[AbstractRandomAffine]) -> Mixture:
-        """Return the mixture of the one link in `links`, with the arrival probability p, and of z = 0."""
+        """Return the mixture of the only link in `links`, with the arrival probability p, and of z = 0, with 1 - p."""
         (link,) = links
         return Mixture([link, silent(link.outputs, link.inputs)], library(p).stack([p, 1 - p]), radius)
 
@@ -242,7 +242,7 @@ def with_direct_link(relayed: AbstractRandomAffine, direct: AbstractRandomAffine
 
 
 def _delay_all_like_latest(links: Sequence[AbstractRandomAffine]) -> list[AbstractRandomAffine]:
-    """Return links of one signal, each as late as the latest."""
+    """Return links of one signal as maps of one delay line (y_k, ..., y_{k-past}), as long as the latest needs."""
     past = max(c.past for c in links)
     return [c if c.past == past else place_channel_of_part(c, signal_size(c), 0, past) for c in links]
 
@@ -263,8 +263,8 @@ def parallel(channels: Sequence[AbstractRandomAffine]) -> Stack:
 
 def _select_part_for_each_link(links: Sequence[AbstractRandomAffine]) -> list[AbstractRandomAffine]:
     """Return links that take the whole signal, each of which selects its own part of it, one part after another."""
-    # past: the most steps by which a link may be late. All links are given so many earlier signals.
-    size, past = sum(signal_size(link) for link in links), max(link.past for link in links)
+    size = sum(signal_size(link) for link in links)
+    past = max(link.past for link in links)  # the most steps by which a link is late: all get so many earlier signals
     links_of_whole_signal = []
     start = 0  # the first component of the link's part of the signal
     for link in links:
@@ -309,7 +309,8 @@ def _add_up_links(links: Sequence[AbstractRandomAffine], noise: NoiseLike, same:
         raise fail("links of a sum", "links of one number of outputs", sizes)
     if instance("same", same, bool, "True or False") and len(set(sent)) > 1:
         raise fail("links of a sum (same=True)", "links that all carry all of y", f"links of {sent} numbers")
-    past, total = max(link.past for link in links), sent[0] if same else sum(sent)
+    past = max(link.past for link in links)
+    total = sent[0] if same else sum(sent)  # length of y
     starts = [0] * len(links) if same else np.cumsum([0, *sent[:-1]]).tolist()  # of each link's part in y
     components_by_link = []
     for link, start, size in zip(links, starts, sent, strict=True):
@@ -344,7 +345,9 @@ def mean_gain(channel: Channel) -> Channel:
 
     def mean_of(channel: AbstractRandomAffine) -> AbstractRandomAffine:
         """Return the channel of one step with its gains at their means; raise ValueError if it remembers."""
-        check_forgets("channel taken at its mean gain", check_maps("channel taken at its mean gain", [channel])[0])
+        what = "channel taken at its mean gain"  # in errors
+        (checked,) = check_maps(what, [channel])
+        check_forgets(what, checked)
         return channel.mean_gain()
 
     at_mean: Channel = at_each_step(mean_of, channel)
@@ -354,9 +357,9 @@ def mean_gain(channel: Channel) -> Channel:
 def check_link(
     sensor: AbstractSensor, channel: AbstractRandomAffine, states: int, late: bool = False, moments: bool = True
 ) -> None:
-    """Raise ValueError unless sensor and channel fit each other and the state.
+    """Raise ValueError unless sensor and channel fit each other and a state of so many `states`.
 
-    `late`: delays are known here; `moments`: the noise's covariance is needed, and must exist.
+    `late`: True if the caller can handle delays; `moments`: True if it needs the covariance of the noise.
     """
     check_sensor(sensor, states)
     sensor.refuse_inputs("such a filter or channel")

@@ -57,7 +57,10 @@ class Pilot(Module):
     fresh: bool = eqx.field(static=True)
 
     def __init__(self, noise: "Float[ArrayLike, '']", fresh: bool = True):
-        """Check and hold the variance of a reading's error, and whether each message has a fresh gain."""
+        """Check and hold the variance of the error e in a pilot's reading a = g + e of a link's gain g.
+
+        `fresh` says whether each message has a gain drawn independently of the others; else claims are nominal.
+        """
         self.noise = scalar("noise of a pilot", noise, np.finfo(float).tiny)
         self.fresh = flag("fresh", fresh)
 
@@ -111,7 +114,7 @@ def told(
 
 
 def _check_law(law: object) -> AbstractLaw | AbstractNoise | None:
-    """Return a law of reported numbers, or None, as it is; raise ValueError for anything else."""
+    """Return the law of the numbers that messages report, None for none; raise ValueError for anything else."""
     if law is None or isinstance(law, AbstractLaw | AbstractNoise):
         return law
     raise fail("law of the numbers told", "a noise law, a law of gains, or a MarkovChain", show_value(law))
@@ -162,7 +165,10 @@ def append_told_gain(hop: GainAndNoise, known: KnownGain) -> GainAndNoise | Stac
 
 
 def append_told_numbers(link: AbstractRandomAffine) -> Stack:
-    """Return a link that delivers, after z, the numbers that each message reports of the maps inside the link."""
+    """Return a link that delivers its z and then the numbers that messages report of the maps inside the link.
+
+    Such a map's law is a function of reported ("told") numbers, such as its present gain.
+    """
     return Stack([link, *_list_told_outputs(link, link.inputs)])
 
 
@@ -172,9 +178,12 @@ def _list_told_outputs(link: AbstractRandomAffine, sent: int) -> list[ModeOutput
 
 
 class SeparatedToldNumbers(NamedTuple):
-    """A channel taken apart: its link without reported numbers, and the rows of z with the link's values and with them.
+    """A channel taken apart: its link without reported numbers, and which rows of z are the link's and which are they.
 
-    Reported numbers are in the order of the link's `list_told_maps`, each once.
+    Args:
+        link: the channel without the numbers that messages report, such as its gain.
+        values: rows of z that the link delivers.
+        numbers: rows of z with reported numbers, in the order of the link's `list_told_maps`, each once.
     """
 
     link: AbstractRandomAffine
@@ -234,7 +243,8 @@ def stack_channels_with_told_numbers(
             returns as many maps of the whole signal, from which each selects its own.
         channels: the channels.
     """
-    links, maps = [separate_told_numbers(channel).link for channel in channels], list[AbstractRandomAffine]()
+    links = [separate_told_numbers(channel).link for channel in channels]
+    maps = list[AbstractRandomAffine]()
     for link, channel, widened_link in zip(links, channels, widen(links), strict=True):
         maps.append(widened_link)
         # A channel that reports nothing is its own link. For any other, append maps to the reported numbers.

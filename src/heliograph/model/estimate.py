@@ -45,7 +45,7 @@ class Estimate(Module):
     attitude: tuple[int, ...] = eqx.field(static=True, default=(), repr=False)
 
     def __check_init__(self) -> None:
-        """Raise ValueError unless the claim is one."""
+        """Raise ValueError unless `claim` is "exact", "upper", "nominal" or "none"; called after construction."""
         check_claim(self.claim)
 
     def error(self, truth: Float[Array, "... n"]) -> Any:
@@ -101,7 +101,7 @@ class Innovation(Module):
 
 
 def check_claim(claim: object) -> None:
-    """Raise ValueError where there is no such claim."""
+    """Raise ValueError unless `claim` is "exact", "upper", "nominal" or "none"."""
     if not isinstance(claim, str) or claim not in STRENGTH:
         raise fail("claim", f"one of {', '.join(STRENGTH)}", show_value(claim))
 
@@ -152,8 +152,8 @@ def _mask_covariances_over_time(matrices: np.ndarray) -> np.ndarray:
     if matrices.ndim == 3 and len(matrices) > 2 and np.array_equal(matrices[-1], matrices[len(matrices) // 2]):
         rows = matrices.reshape(len(matrices), -1)
         is_new = np.append(True, (rows[1:] != rows[:-1]).any(axis=1))
-        number_of_last_new = np.cumsum(is_new) - 1
-        return np.asarray(_mask_covariances(matrices[is_new])[number_of_last_new])
+        index_among_new = np.cumsum(is_new) - 1  # for each matrix, that of the last new one
+        return np.asarray(_mask_covariances(matrices[is_new])[index_among_new])
     return _mask_covariances(matrices)
 
 

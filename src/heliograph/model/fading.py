@@ -85,6 +85,7 @@ def markov_fading(
     if isinstance(transition, MarkovChain) and name is not None:
         raise fail("name", "none beside a chain, which has its own", repr(name))
     chain = transition if isinstance(transition, MarkovChain) else MarkovChain(transition, name=name)
+    # Gains are channels, or else numbers.
     channels = [gain for gain in gains if isinstance(gain, AbstractRandomAffine)] if isinstance(gains, Sequence) else []
     if channels:
         if noise is not None:
@@ -92,7 +93,8 @@ def markov_fading(
         return Modes(chain, channels)
     if noise is None:
         raise fail("noise", "one for gains that are numbers", "none")
-    return Modes(chain, [hop(g, noise) for g in array("gains of the modes", cast(ArrayLike, gains), (None,))])
+    numbers = array("gains of the modes", cast(ArrayLike, gains), (None,))
+    return Modes(chain, [hop(gain, noise) for gain in numbers])
 
 
 def autoregressive_fading(
@@ -148,7 +150,8 @@ def with_flag(
     # Find the chain. `held`: all memories of the channel (chains, and gains that drift). Classes tell of the modes of a
     # single chain, so with several memories the chain must be given.
     held = list(memories(channel).values())
-    is_undecided = not held or (probabilities is not None and len(held) > 1)
+    are_classes = probabilities is not None
+    is_undecided = not held or (are_classes and len(held) > 1)
     if chain is None and is_undecided:
         raise fail("chain", "one that the flag tells of, since the channel does not hold just one", "none")
     # Without classes the states themselves are received.
@@ -245,5 +248,5 @@ def memory_matters(channel: Channel) -> bool:
 
 
 def uncertain_chain(channel: Channel) -> bool:
-    """Return whether a chain in the channel is known only within a radius."""
+    """Return whether a Markov chain in the channel has transition probabilities that are known only within bounds."""
     return any(memory.is_uncertain for memory in memories(channel).values())

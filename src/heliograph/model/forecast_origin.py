@@ -75,7 +75,7 @@ def find_median_spacing(time: np.ndarray) -> float:
     """Return the median time between rows, in seconds for dates, or NaN for fewer than two rows."""
     if len(time) < 2:
         return float("nan")
-    steps = seconds_between(np.asarray(time))[1:]
+    steps = seconds_between(np.asarray(time))[1:]  # from row to row; entry 0 is of the first row and says nothing
     # Equal steps need no sorting.
     return float(steps[0] if steps.min() == steps.max() else np.median(steps))
 

@@ -18,7 +18,7 @@ from heliograph.random_affine.noises.noise import as_noise, count_components
 
 
 class MeasureUnderInputs(Module):
-    """x -> h(x, u) of a known u."""
+    """The function x -> h(x, u) of a sensor under known inputs u; `function` is h."""
 
     function: Callable[..., ArrayLike]
     u: jax.Array
@@ -47,7 +47,7 @@ class NoiseOfInputs(Module):
         return value * jnp.eye(self.outputs) if value.ndim == 0 else value
 
     def _refuse(self) -> Any:
-        """Raise ValueError: what asks for the law's numbers needs a constant one, and this depends on `inputs`."""
+        """Raise ValueError: what reads the mean or covariance needs a constant law, and this one depends on inputs."""
         expected = "a constant one, as what is computed before data needs"
         raise fail("sensor noise", expected, f"one of {list(self.inputs)}")
 
@@ -55,12 +55,15 @@ class NoiseOfInputs(Module):
 
 
 def read_input_names(inputs: Names) -> tuple[str, ...]:
-    """Return names of inputs, each once."""
+    """Return the names of a sensor's inputs as a tuple; raise ValueError for one that stands twice, or no names."""
     return names("inputs of a sensor", inputs, len(name_list("inputs of a sensor", inputs)), "u")
 
 
 def count_matrix_rows(matrix: object, inputs: tuple[str, ...]) -> int:
-    """Return the number of rows of a matrix, or of the matrix that a function of the inputs returns."""
+    """Return the number of rows of a sensor's matrix, which is an array or a function of the inputs u.
+
+    A function is traced with as many inputs as it has names; raise ValueError if it returns no matrix.
+    """
     if not callable(matrix):
         return int(array("sensor matrix", cast(ArrayLike, matrix), ("outputs", "states")).shape[-2])
     try:
@@ -78,15 +81,21 @@ def read_noise_of_inputs(
     """Return the names of the outputs, and the noise: a law, or a covariance that depends on inputs.
 
     Args:
-        noise: a law, a covariance, a variance, or a function of the inputs that returns a covariance.
+        noise: a law, a covariance, a variance, or a function of the inputs that returns a covariance. A function is
+            tried once, with all inputs 1, to check the shape of what it returns.
         outputs: names of the outputs; y, or y0, y1, ... for None.
         rows: number of rows of the sensor's matrix; None for a sensor without one.
         inputs: names of the inputs on which the noise may depend.
     """
     # The number of outputs comes from the sensor's matrix, else from their names, else from the noise, else it is 1.
-    components = None if callable(noise) else count_components(noise)
-    count_without_matrix = (components or 1) if outputs is None else len(name_list("sensor outputs", outputs))
-    count = rows or count_without_matrix
+    components_of_noise = None if callable(noise) else count_components(noise)
+    names_given = None if outputs is None else name_list("sensor outputs", outputs)
+    if rows:
+        count = rows
+    elif names_given is not None:
+        count = len(names_given)
+    else:
+        count = components_of_noise or 1
     named = names("sensor outputs", outputs, count, "y")
     if not callable(noise):
         return named, as_noise("sensor noise", noise, count)
@@ -96,7 +105,10 @@ def read_noise_of_inputs(
 
 
 def read_function_of_state_alone(measure: object) -> Callable[[jax.Array], ArrayLike]:
-    """Return a sensor's function h(x); raise ValueError if it needs more arguments than the state."""
+    """Return a sensor's function h(x); raise ValueError if it cannot be called with the state x alone.
+
+    Functions of (x, u) need names for their inputs, with which the user would have got another check.
+    """
     checked: Callable[[jax.Array], ArrayLike] = function("measure of a sensor", measure, "x")
     try:
         signature = inspect.signature(checked)
@@ -111,7 +123,10 @@ def read_function_of_state_alone(measure: object) -> Callable[[jax.Array], Array
 
 
 def require_constant(name: str, value: object) -> Any:
-    """Return a sensor's matrix or noise as it is; raise ValueError for a function, as its inputs have no names here."""
+    """Return a sensor's matrix or noise, the `value`, as it is; raise ValueError if it is a function.
+
+    A function needs named inputs of the sensor, and here it has none. `name` is what it is called in the error.
+    """
     if callable(value):
         expected = "a constant, or inputs=[...], the names of those of the plant that a function takes"
         raise fail(name, expected, "a function")

@@ -56,13 +56,13 @@ class SwitchingRates(Module):
         if np.linalg.cond(vectors) > APART:
             raise fail("rates", "as many eigenvectors as modes (change one rate a little)", G.tolist())
         projectors = np.einsum("ik,kj->kij", vectors, np.linalg.inv(vectors))
-        self.growth, self.turn = values.real, values.imag
+        self.growth, self.turn = values.real, values.imag  # of the eigenvalues
         self.real, self.imaginary = projectors.real, projectors.imag
 
     def transition_over(self, time: jax.Array) -> jax.Array:
         """Return exp(G t), the transition probabilities (modes, modes) over a time t under the rates G.
 
-        It is computed from the eigenvalues growth_k + i turn_k of G and their projectors real_k + i imaginary_k.
+        It is sum_k e^(growth_k t) (cos(turn_k t) real_k - sin(turn_k t) imaginary_k), by eigenvalues and projectors.
         """
         size = jnp.exp(jnp.asarray(self.growth) * time)
         cosine, sine = size * jnp.cos(self.turn * time), size * jnp.sin(self.turn * time)
@@ -89,7 +89,7 @@ class ModalPlant(AbstractPlant, AbstractWithMemory):
     inputs: tuple[str, ...] = eqx.field(static=True)
 
     def __init__(self, memory: MarkovChain, models: Sequence[AbstractPlant], rates: "SwitchingRates | None" = None):
-        """Hold the chain and the plant of each mode; names and initial law are the first one's, as of all."""
+        """Hold the chain and the plant of each mode; names and law of x_0 are the first one's, as all have the same."""
         self.memory, self.rates = instance("memory", memory, MarkovChain, "a MarkovChain"), rates
         self.models = _read_mode_models("models of a plant", models, AbstractPlant)
         first_plant = self.models[0]
@@ -101,27 +101,27 @@ class ModalPlant(AbstractPlant, AbstractWithMemory):
 
     @property  # type: ignore[misc]
     def noise(self) -> Any:  # type: ignore[override]
-        """Refused: the noise is that of a mode."""
+        """Raise ValueError: the noise is that of a mode (`given`)."""
         return self._refuse()
 
     def transition(self, x: jax.Array, u: jax.Array) -> jax.Array:
-        """Refused: the law of motion is that of a mode."""
+        """Raise ValueError: the law of motion is that of a mode (`given`)."""
         return self._refuse()
 
     def noise_covariance(self, u: jax.Array) -> jax.Array:
-        """Refused: the noise is that of a mode."""
+        """Raise ValueError: the noise is that of a mode (`given`)."""
         return self._refuse()
 
     def noise_mean(self) -> jax.Array:
-        """Refused: the noise is that of a mode."""
+        """Raise ValueError: the noise is that of a mode (`given`)."""
         return self._refuse()
 
     def sample_noise(self, key: jax.Array, u: jax.Array) -> jax.Array:
-        """Refused: the noise is that of a mode."""
+        """Raise ValueError: the noise is that of a mode (`given`)."""
         return self._refuse()
 
     def given(self, state: int | float | jax.Array | np.ndarray) -> AbstractPlant:
-        """Return the plant of mode `state`; for a traced one a plant with that mode's numbers, or a choice of them."""
+        """Return the plant of the mode numbered `state`; for a number traced by JAX, one that picks it."""
         if isinstance(state, int | np.integer):
             return self.models[state]
         chosen = select_model_of_equal_structure(self.models, jnp.asarray(state))
@@ -134,7 +134,7 @@ class ModalPlant(AbstractPlant, AbstractWithMemory):
 
 
 class _ChosenPlant(AbstractPlant):
-    """One of several plants, by a traced index."""
+    """The plant models[index], for an index that JAX traces: all are computed, and the result of one is taken."""
 
     models: tuple[AbstractPlant, ...]
     index: jax.Array
@@ -146,7 +146,7 @@ class _ChosenPlant(AbstractPlant):
     inputs: tuple[str, ...] = eqx.field(static=True)
 
     def __init__(self, models: tuple[AbstractPlant, ...], index: jax.Array):
-        """Hold all plants and the index of the chosen one; names and initial law are the first one's."""
+        """Hold all plants and the chosen one's index; names and law of x_0 are the first's, as all have the same."""
         self.models, self.index, self.noise = models, index, None
         first_plant = models[0]
         self.initial_mean, self.initial_covariance = first_plant.initial_mean, first_plant.initial_covariance
@@ -182,11 +182,11 @@ class ModalSensor(AbstractSensor, AbstractWithMemory):
 
     @property  # type: ignore[misc]
     def noise(self) -> Any:  # type: ignore[override]
-        """Refused: the noise is that of a mode."""
+        """Raise ValueError: the noise is that of a mode (`given`)."""
         return self._refuse()
 
     def measure(self, x: jax.Array) -> jax.Array:
-        """Refused: what is measured is up to the mode."""
+        """Raise ValueError: what is measured is up to the mode (`given`)."""
         return self._refuse()
 
     def check_states(self, states: int) -> None:
@@ -195,7 +195,7 @@ class ModalSensor(AbstractSensor, AbstractWithMemory):
             model.check_states(states)
 
     def given(self, state: int | float | jax.Array | np.ndarray) -> AbstractSensor:
-        """Return the sensor of mode `state`; of a traced one a sensor with that mode's numbers, or a choice of them."""
+        """Return the sensor of the mode numbered `state`; for a number traced by JAX, one that picks it."""
         if isinstance(state, int | np.integer):
             return self.models[state]
         chosen = select_model_of_equal_structure(self.models, jnp.asarray(state))
@@ -208,13 +208,13 @@ class ModalSensor(AbstractSensor, AbstractWithMemory):
 
 
 class _ChosenNoise(Module):
-    """The noise of one of several sensors, by a traced index: it can be drawn."""
+    """The noise noises[index] of one of several sensors, for an index that JAX traces; it can only be drawn."""
 
     noises: tuple[AbstractNoise, ...]
     index: jax.Array
 
     def sample(self, key: jax.Array) -> jax.Array:
-        """Draw from the noise of the index."""
+        """Draw from all noises with the same key, and return the draw of the one that `index` says."""
         return jnp.stack([noise.sample(key) for noise in self.noises])[self.index]
 
     def report(self, value: jax.Array) -> jax.Array:
@@ -223,7 +223,7 @@ class _ChosenNoise(Module):
 
 
 class _ChosenSensor(AbstractSensor):
-    """One of several sensors, by a traced index."""
+    """The sensor models[index], for an index that JAX traces: all measure, and the result of one is taken."""
 
     models: tuple[AbstractSensor, ...]
     index: jax.Array
@@ -343,7 +343,7 @@ def transition_over(plant: AbstractPlant, u: jax.Array, chain: jax.Array) -> jax
 
 
 def list_mode_models(model: Any) -> tuple[Any, ...]:
-    """Return the models of a plant's or sensor's modes, itself alone where it has none."""
+    """Return the plants or sensors of all modes of one with modes; of one without modes itself alone."""
     return model.models if isinstance(model, ModalPlant | ModalSensor) else (model,)
 
 

@@ -30,9 +30,9 @@ class OverTime(Module):
     def __init__(self, values: object):
         """Hold an array, or a model of arrays, whose leading axes are all time and have one length."""
         self.values = jax.tree.map(_convert_leaf, values)
-        steps = {leaf.shape[0] if leaf.ndim else None for leaf in _list_arrays(self.values)}
-        if len(steps) != 1 or None in steps:
-            raise fail("OverTime", "arrays that share one leading time axis", f"lengths {sorted(map(str, steps))}")
+        lengths = {leaf.shape[0] if leaf.ndim else None for leaf in _list_arrays(self.values)}  # None of a number
+        if len(lengths) != 1 or None in lengths:
+            raise fail("OverTime", "arrays that share one leading time axis", f"lengths {sorted(map(str, lengths))}")
 
     @property
     def steps(self) -> int:
@@ -41,17 +41,23 @@ class OverTime(Module):
 
 
 def _convert_leaf(leaf: object) -> object:
-    """Return numbers and lists as arrays of doubles, anything else as it is."""
+    """Return a leaf of a model: numbers and lists as arrays of doubles, anything else as it is."""
     return np.asarray(leaf, dtype=np.float64) if isinstance(leaf, int | float | list) else leaf
 
 
 def _list_arrays(tree: object) -> list[PyTree]:
-    """Return the arrays of a tree."""
+    """Return the arrays among the leaves of a model object."""
     return [leaf for leaf in jax.tree.leaves(tree) if eqx.is_array(leaf)]
 
 
 def stack(models: Sequence[T]) -> T:
-    """Stack model objects of one structure into one object whose arrays have a new leading axis."""
+    """Stack model objects of one structure into one object whose arrays have a new leading axis.
+
+    Everything that is no array must be the same in all of them, and is kept.
+
+    Raises:
+        ValueError: objects of different structures, or arrays of different shapes.
+    """
     leaves_and_structures = [jax.tree.flatten(model) for model in models]
     if len({_describe_structure(leaves, structure) for leaves, structure in leaves_and_structures}) != 1:
         raise fail("stack", "objects of one structure and one set of shapes", "objects that differ")
@@ -69,7 +75,7 @@ def structure_key(model: object) -> Hashable:
 
 
 def _describe_structure(leaves: Sequence[Any], tree: Hashable) -> Hashable:
-    """Return a key of a tree's form, the shapes of its arrays and its other leaves."""
+    """Return a hashable key of a flattened model: its tree, the shapes of its arrays, and its other leaves."""
     return tree, tuple(("array", leaf.shape) if eqx.is_array(leaf) else leaf for leaf in leaves)
 
 
@@ -79,7 +85,7 @@ def have_same_structure(a: object, b: object) -> bool:
 
 
 def _stack_leaves(*leaves: PyTree) -> object:
-    """Return arrays stacked along a new first axis, by JAX if one of them is JAX's."""
+    """Return arrays of one shape stacked along a new first axis: a NumPy array, or JAX's if one of them is JAX's."""
     if any(isinstance(leaf, jax.Array) for leaf in leaves):
         return jnp.stack(leaves)
     return np.stack(leaves)
@@ -111,7 +117,7 @@ def at(tree: PyTree, k: int | np.integer | Int[np.ndarray | Array, ""]) -> PyTre
     """
 
     def read(leaf: object) -> PyTree:
-        """Return the k-th values of an `OverTime`, anything else as it is."""
+        """Return the k-th values of an `OverTime` in the tree, any other leaf as it is."""
         if not isinstance(leaf, OverTime):
             return leaf
         # Only arrays have an axis of steps. Everything else is the same at all steps.
@@ -140,7 +146,7 @@ def steps_covered(tree: object) -> int | None:
 
 
 def unstack(model: object) -> list[PyTree]:
-    """Return the object of each step, as `over_time` was given it; of one that does not vary this alone."""
+    """Return a list with the object of each step of an `OverTime`, or with the object alone if it does not vary."""
     return [at(model, i) for i in range(model.steps)] if isinstance(model, OverTime) else [model]
 
 
@@ -155,12 +161,15 @@ def list_models_by_step(model: PyTree, count: int) -> list[PyTree]:
 
 
 def stack_over_time(model: PyTree) -> PyTree:
-    """Return what varies over time as one object whose arrays have a first axis of time; another as it is."""
+    """Return the object inside an `OverTime`, whose arrays have a first axis of time; any other object as it is."""
     return model.values if isinstance(model, OverTime) else model
 
 
 def at_each_step(function: Callable[..., object], *items: object) -> PyTree:
-    """Return function(*items), or an `OverTime` of its results where some item varies."""
+    """Return function(*items); if some item is an `OverTime`, an `OverTime` of the function's result at each step.
+
+    Steps are as many as all varying items cover. So a function of constant models serves models that vary.
+    """
     steps = steps_covered(items)
     return function(*items) if steps is None else over_time([function(*at(items, k)) for k in range(steps)])
 

@@ -48,7 +48,7 @@ class MatrixOfInputs(Module):
     inputs: tuple[str, ...] = eqx.field(static=True)
 
     def __call__(self, u: jax.Array) -> jax.Array:
-        """Return M(u)."""
+        """Return M(u) for the plant's inputs u (inputs,)."""
         return as_real(self.function(u))
 
     def _refuse(self, *_: object, **__: object) -> NoReturn:
@@ -59,7 +59,7 @@ class MatrixOfInputs(Module):
 
 
 def matrix_under_inputs(matrix: object, u: jax.Array) -> jax.Array:
-    """Return a constant matrix, or the value of one that depends on inputs."""
+    """Return a constant matrix as it is, or the value under the inputs u of a matrix that depends on them."""
     return matrix(u) if isinstance(matrix, MatrixOfInputs) else jnp.asarray(matrix)
 
 
@@ -99,12 +99,12 @@ class AbstractPlant(Module):
         return Manifold(self.angles, tuple(self.states.index(name) for name in self.attitude))
 
     def difference(self, x: A, other: A) -> A:
-        """Return the change from `other` to x, states (..., n): x - other, angles between -pi and pi, turns."""
+        """Return x - other of states (..., n); for angles between -pi and pi, for attitudes the turn to x."""
         change: A = self.manifold.difference(x, other)
         return change
 
     def plus(self, x: A, change: A) -> A:
-        """Return the state x (..., n) changed: x + change, angles between -pi and pi, attitudes turned."""
+        """Return x + change of a state (..., n): angles are wrapped to -pi to pi, attitudes turned by the change."""
         changed: A = self.manifold.plus(x, change)
         return changed
 
@@ -176,7 +176,7 @@ class JointNoise(Module):
     indices: tuple[tuple[int, ...], ...] = eqx.field(static=True)
 
     def __call__(self, u: jax.Array) -> jax.Array:
-        """Return the covariance under the input u."""
+        """Return the block-diagonal covariance (n, n) of all noises under all inputs u."""
         pairs = zip(self.plants, split_inputs(u, self.indices), strict=True)
         return jnp.asarray(jax.scipy.linalg.block_diag(*(plant.noise_covariance(own) for plant, own in pairs)))
 
@@ -186,7 +186,7 @@ class JointNoise(Module):
         return jnp.concatenate([plant.noise_mean() for plant in self.plants])
 
     def sample(self, key: jax.Array, u: jax.Array) -> jax.Array:
-        """Draw each plant's."""
+        """Draw the noise of every plant, each with a key and inputs of its own; the draws follow one another."""
         parts = zip(self.plants, jax.random.split(key, len(self.plants)), split_inputs(u, self.indices), strict=True)
         return jnp.concatenate([plant.sample_noise(k, own) for plant, k, own in parts])
 
@@ -308,7 +308,7 @@ class LinearPlant(AbstractPlant):
         varies = any(callable(entry) for entry in (matrix, input_matrix, noise))
         if varies and not inputs:
             raise fail("inputs", "the names of those that plant matrices depend on, such as ['dt']", "none")
-        count = None if inputs is None or not varies else len(name_list("input names", inputs))
+        count = None if inputs is None or not varies else len(name_list("input names", inputs))  # None: B says it
         B: Any = np.zeros((n, count or 0)) if input_matrix is None else input_matrix
         if not callable(B):
             B = array("input matrix", B, (n, count))
@@ -324,7 +324,7 @@ class LinearPlant(AbstractPlant):
         check_turn_invariance("plant", self.transition, self.initial_mean, self.manifold, self.manifold, u)
 
     def _read_matrix(self, name: str, value: MatrixLike, shape: tuple[int, int]) -> Any:
-        """Return a matrix of the plant as an array, or as a function of the inputs u, with its shape checked."""
+        """Return a plant's matrix of a given shape: an array, or a `MatrixOfInputs` if `value` is a function of u."""
         if not callable(value):
             return array(name, value, shape)
         check_shape(f"{name}(u)", value, (np.zeros(len(self.inputs)),), shape)
@@ -393,7 +393,7 @@ def check_shape(name: str, called: Callable[..., object], values: tuple[object, 
 
 
 def read_first_plant(plant: AnyPlant) -> Any:
-    """Return the plant at its first step."""
+    """Return the plant at its first step; raise ValueError if it is none, or its noise has no covariance."""
     plant_0 = instance("plant", first(plant), AbstractPlant, "a plant")
     if isinstance(plant_0.noise, AbstractNoise):
         _ = plant_0.noise.covariance  # raises if it does not exist

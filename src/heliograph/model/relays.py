@@ -49,11 +49,15 @@ class RelayNetwork(Module):
     relays: tuple[str, ...] = eqx.field(static=True)
 
     def __init__(self, plant: AnyPlant, sensor: AnySensor, relays: Sequence[str], slots: Sequence[Slot]):
-        """Check and hold a plant, its sensor, the relays' names, and the links of each slot of the schedule."""
+        """Check and hold a plant, its sensor, the relays' names, and the links of each slot of the schedule.
+
+        `slots[k][listener][sender]` is the link of slot k from a sender to a listener; listeners without links are left
+        out.
+        """
         self.plant, self.sensor = plant, sensor
         self.relays = names("relays", relays, len(items("relays", relays, "names")), "relay")
-        listeners = [table("slot", slot, "links of a listener") for slot in items("slots", slots, "dictionaries")]
-        read = [{to: table(f"links to {to!r}", links, "links") for to, links in slot.items()} for slot in listeners]
+        given_slots = [table("slot", slot, "links of a listener") for slot in items("slots", slots, "dictionaries")]
+        read = [{to: table(f"links to {to!r}", links, "links") for to, links in slot.items()} for slot in given_slots]
         self.slots = tuple({listener: links for listener, links in slot.items() if links} for slot in read)
         _check_linear(first(plant), first(sensor))
         if len({*self.relays, SENSOR, RECEIVER}) != len(self.relays) + 2:
@@ -75,7 +79,7 @@ class RelayNetwork(Module):
     def received(self) -> tuple[int, ...]:
         """Return how many numbers each filter receives in a step, in the order of `filters`: relays, then the receiver.
 
-        The first link to a filter in any slot tells, since all deliver equally many.
+        It is the number of outputs of the first link to a filter in any slot, since all its links have equally many.
         """
         return tuple(
             next(first(link).outputs for slot in self.slots for link in slot.get(name, {}).values())
@@ -89,9 +93,13 @@ class RelayNetwork(Module):
         return names
 
     def always_receives(self, name: str) -> bool:
-        """Return whether some hop leads to this listener in every slot, and none of them erases."""
-        observed = [slot.get(name, {}) for slot in self.slots]
-        return all(observed) and not any(first(hop).erases for hops in observed for hop in hops.values())
+        """Return whether a listener, a relay or the receiver, gets numbers in every slot.
+
+        In each slot some link leads to it, and none of its links loses messages (erases).
+        """
+        links_by_slot = [slot.get(name, {}) for slot in self.slots]
+        some_link_erases = any(first(link).erases for links in links_by_slot for link in links.values())
+        return all(links_by_slot) and not some_link_erases
 
     def initial(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the mean (n,) and covariance (n, n) of x_0."""
@@ -220,7 +228,7 @@ def _compute_slot_moments(network: RelayNetwork, slot: Slot, k: int) -> _SlotMom
     starts = dict(zip(network.filters, np.cumsum((0, *network.received[:-1])), strict=True))
     gain, offset, receives = np.zeros((rows, columns)), np.zeros(rows), np.zeros(rows)
     covariance, transmits = np.zeros((rows, rows, columns + 1, columns + 1)), np.zeros(len(senders))
-    for listener, links in slot.items():
+    for listener, links in slot.items():  # slot[listener][sender] is the link
         for sender, link in links.items():
             # Mean gain and offset of the link z = G s + n, and covariances of the entries of (G, n).
             moments = second_order(at(link, k))
@@ -263,7 +271,14 @@ def _check_linear(plant: object, sensor: object) -> None:
 
 
 def _check_listener(network: RelayNetwork, number: int, listener: str, links: Links) -> None:
-    """Raise unless the links into one listener in one slot come from known senders and fit them and each other."""
+    """Raise ValueError unless the links to one listener in one slot come from known senders, and fit them.
+
+    Args:
+        network: the network, of which filters, relays and sensor are known already.
+        number: number of the slot, for errors.
+        listener: who receives, a relay or the receiver.
+        links: link from each sender.
+    """
     where = f"slot {number}, {listener!r}"
     # Names.
     if listener not in network.filters:
@@ -285,9 +300,10 @@ def _check_listener(network: RelayNetwork, number: int, listener: str, links: Li
 
 
 def _check_reached(network: RelayNetwork, name: str) -> None:
-    """Raise ValueError if nobody ever transmits to the relay, or to the receiver (RECEIVER), called `name`.
+    """Raise ValueError unless somebody transmits to a relay or to the receiver, called `name`, in some slot.
 
-    A slot maps each receiver to its senders with their links.
+    A relay that hears nothing but itself is refused too. `network.slots[k][listener]` has the links to a listener in
+    slot k, by sender.
     """
     senders = {sender for slot in network.slots for sender in slot.get(name, {})}  # in any slot of the schedule
     if name == RECEIVER and not senders:

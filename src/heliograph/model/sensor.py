@@ -152,25 +152,22 @@ class Sensor(AbstractSensor):
         `measure` is h, `noise` the law of v, `circular` names outputs that are angles, and `inputs` names those of u.
         `resolution`: step to which outputs are rounded, which adds to the noise.
         """
-        # A function of (x, u), with a noise that may depend on u too.
         self.inputs = read_input_names(inputs)
-        if self.inputs:
+        if self.inputs:  # a function of (x, u), with a noise that may depend on u too
             self.function = function("measure of a sensor", measure, "(x, u)")
             self.outputs, self.noise = read_noise_of_inputs(noise, outputs, rows=None, inputs=self.inputs)
-            self.circular = read_angles("circular outputs", circular, self.outputs)
-            self.noise = _round_noise_to_resolution(self.noise, resolution, self.circular)
-            return
-        # A function of x alone: the number of outputs is that of their names, or of the noise's components, or one.
-        self.function, law = read_function_of_state_alone(measure), require_constant("sensor noise", noise)
-        count = (count_components(law) or 1) if outputs is None else len(name_list("sensor outputs", outputs))
-        self.noise = as_noise("sensor noise", law, count)
-        self.outputs = names("sensor outputs", outputs, count, "y")
-        # A variance alone says nothing of the number of outputs: without names the function must have one.
-        is_said = outputs is not None or count_components(law) is not None
-        shape = (1,) if is_said else _find_output_shape(measure)
-        if shape != (1,):
-            expected = "one output, as a variance without names means (outputs=[...] names more)"
-            raise fail("measure of a sensor", expected, f"shape {shape}")
+        else:
+            # A function of x alone: the number of outputs is that of their names, or of the noise's components, or one.
+            self.function, law = read_function_of_state_alone(measure), require_constant("sensor noise", noise)
+            count = (count_components(law) or 1) if outputs is None else len(name_list("sensor outputs", outputs))
+            self.noise = as_noise("sensor noise", law, count)
+            self.outputs = names("sensor outputs", outputs, count, "y")
+            # A variance alone says nothing of the number of outputs: without names the function must have one.
+            is_count_given = outputs is not None or count_components(law) is not None
+            shape = (1,) if is_count_given else _find_output_shape(measure)
+            if shape != (1,):
+                expected = "one output, as a variance without names means (outputs=[...] names more)"
+                raise fail("measure of a sensor", expected, f"shape {shape}")
         self.circular = read_angles("circular outputs", circular, self.outputs)
         self.noise = _round_noise_to_resolution(self.noise, resolution, self.circular)
 
@@ -212,19 +209,21 @@ class LinearSensor(AbstractSensor):
         resolution: "ArrayLike | None" = None,
         inputs: "Names" = (),
     ):
-        """Check and hold y = C x + v: C and the covariance of v, which may depend on u, names, resolution."""
+        """Check and hold y = C x + v: C, the law of v, names of outputs, angles and resolution.
+
+        `matrix` is C and `noise` the law of v; with named `inputs` u, C and the covariance of v may be functions of u.
+        `resolution`: step to which outputs are rounded, which adds to the noise.
+        """
         self.inputs = read_input_names(inputs)
         if self.inputs:
             count = count_matrix_rows(matrix, self.inputs)  # C has a row for each output
             self.outputs, self.noise = read_noise_of_inputs(noise, outputs, count, self.inputs)
             C: Any = MatrixOfInputs(matrix, "sensor matrix", self.inputs) if callable(matrix) else matrix
             self.matrix = C if callable(matrix) else array("sensor matrix", C, ("outputs", "states"))
-            self.circular = read_angles("circular outputs", circular, self.outputs)
-            self.noise = _round_noise_to_resolution(self.noise, resolution, self.circular)
-            return
-        self.matrix = array("sensor matrix", require_constant("sensor matrix", matrix), ("outputs", "states"))
-        self.noise = as_noise("sensor noise", require_constant("sensor noise", noise), self.matrix.shape[-2])
-        self.outputs = names("sensor outputs", outputs, self.matrix.shape[-2], "y")
+        else:
+            self.matrix = array("sensor matrix", require_constant("sensor matrix", matrix), ("outputs", "states"))
+            self.noise = as_noise("sensor noise", require_constant("sensor noise", noise), self.matrix.shape[-2])
+            self.outputs = names("sensor outputs", outputs, self.matrix.shape[-2], "y")
         self.circular = read_angles("circular outputs", circular, self.outputs)
         self.noise = _round_noise_to_resolution(self.noise, resolution, self.circular)
 
@@ -294,7 +293,7 @@ def _find_output_shape(measure: Callable[[jax.Array], ArrayLike]) -> tuple[int, 
     one, other = (shape(states) for states in LONG)
     if one is not None and other is not None:
         return one if one == other else (1,)
-    shapes = [taken for states in SHORT if (taken := shape(states)) is not None]
+    shapes = [found for found in map(shape, SHORT) if found is not None]
     return shapes[0] if len(shapes) == 1 else (1,)
 
 
@@ -308,7 +307,7 @@ def without_output_names(model: T) -> T:
 
 
 def _is_sensor(model: object) -> bool:
-    """Return whether an object is a sensor."""
+    """Return whether an object is a sensor, at which a walk through a model's tree stops."""
     return isinstance(model, AbstractSensor)
 
 

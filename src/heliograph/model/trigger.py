@@ -122,7 +122,7 @@ class AbstractTrigger(Module):
         return jnp.where(sender.begun, reason, SendReason.FIRST)
 
     def _event_reason(self) -> int:
-        """Return the reason of a transmission that the rule's event makes."""
+        """Return the reason (`SendReason`) that is recorded where the rule's event makes y be sent."""
         return SendReason.EVENT
 
     def after(self, sender: SenderState, y: jax.Array, reason: jax.Array, arrived: jax.Array) -> SenderState:
@@ -238,7 +238,11 @@ class SendOnDelta(AbstractThreshold):
         region: Region = "box",
         losses: Losses = "unknown",
     ):
-        """Check and hold the threshold, and the silent steps after which y is sent anyway (None: it is not)."""
+        """Check and hold the threshold delta, and after how many silent steps y is sent anyway (None: never).
+
+        y is compared with the value last sent or acknowledged, by a region of size delta: a box, a ball, or an interval
+        for each component. `losses` is what the receiver knows of lost messages.
+        """
         self.delta, self.region = read_threshold(delta), read_choice("region", region, Region)
         self.heartbeat = None if heartbeat is None else np.asarray(check_count("heartbeat", heartbeat))
         self.reference = read_choice("reference", reference, Literal["sent", "acknowledged"])
@@ -267,7 +271,10 @@ class SendOnPredictionError(AbstractThreshold):
     def __init__(
         self, delta: ArrayLike, heartbeat: int | None = None, region: Region = "box", losses: Losses = "unknown"
     ):
-        """Check and hold the threshold, and the silent steps after which y is sent anyway (None: it is not)."""
+        """Check and hold the threshold delta, and after how many silent steps y is sent anyway (None: never).
+
+        y is compared with its prediction; `region` and `losses` as of `SendOnDelta`.
+        """
         self.delta, self.region = read_threshold(delta), read_choice("region", region, Region)
         self.heartbeat = None if heartbeat is None else np.asarray(check_count("heartbeat", heartbeat))
         self.losses, self.reference = read_choice("losses", losses, Losses), "prediction"
@@ -299,7 +306,17 @@ class StochasticTrigger(AbstractTrigger):
         reference: Literal["zero", "prediction"] = "zero",
         losses: Literal["unknown", "known"] = "unknown",
     ):
-        """Check and hold the weight W, a positive number or matrix, and what y is compared with."""
+        """Check and hold the weight W, and what y is compared with.
+
+        y is sent with probability 1 - exp(-e' W e / 2), e = y - r: never where e is 0, nearly always where e is large
+        by the metric W. All components are sent together, so that the region counts as "box", and there is no longest
+        silence (heartbeat), since silence must depend on e alone to be Gaussian.
+
+        Args:
+            weight: W, a positive number (W = weight I) or a positive definite matrix (m, m).
+            reference: "zero" for r = 0, or "prediction" for what both ends expect.
+            losses: whether the receiver can tell a lost message from silence: "unknown" or "known".
+        """
         self.weight = scalar("weight", weight, TINY) if rank("weight", weight) == 0 else covariance("weight", weight)
         if not is_traced(self.weight) and self.weight.ndim and np.linalg.eigvalsh(self.weight)[0] <= 0:
             raise fail("weight", "a positive definite matrix", show_value(self.weight.tolist()))
@@ -346,7 +363,7 @@ class Periodic(AbstractTrigger):
     heartbeat: None = eqx.field(static=True)
 
     def __init__(self, period: int, phase: int = 0):
-        """Check and hold period and phase; y is sent whatever its value, so that its reference plays no part."""
+        """Check and hold period and phase; y is sent whatever its value is, so that the reference plays no part."""
         if check_count("phase", phase, 0) >= check_count("period", period):
             raise fail("phase", f"a whole number below the period {period}", phase)
         self.period, self.phase = np.asarray(period), np.asarray(phase)

@@ -126,7 +126,10 @@ def _turn_attitude_long_way_round(x: np.ndarray, components: Sequence[int]) -> n
 def _evaluate_at_points(
     function: Callable[..., jax.Array], points: jax.Array, rests: tuple[jax.Array, ...]
 ) -> jax.Array:
-    """Return f(x, ...) at each of some points x; point i gets entry i of each array in `rests` as further arguments."""
+    """Return f(x, ...), f the `function`, at each of some points x (points, n), one value after another.
+
+    Point i gets entry i of each array in `rests` as further arguments of f.
+    """
     return jnp.stack([jnp.asarray(function(x, *(values[i] for values in rests))) for i, x in enumerate(points)])
 
 

@@ -43,7 +43,7 @@ def rotation_matrix(attitude: Float[ArrayLike, "*any 3"]) -> Float[Array, "*any 
 
 
 def to_quaternion(attitude: Float[ArrayLike, "*any 3"]) -> Float[Array, "*any 4"]:
-    """Return the unit quaternion (w, x, y, z) of an attitude, w >= 0 up to half a turn.
+    """Return the unit quaternion (w, x, y, z) of an attitude; w >= 0 for rotation vectors of at most half a turn.
 
     Args:
         attitude: rotation vector in radians, as estimates have it. Shape (..., 3).
@@ -73,9 +73,12 @@ def from_quaternion(quaternion: Float[ArrayLike, "*any 4"]) -> Float[Array, "*an
 
 
 def _read_coordinates(name: str, value: ArrayLike, last: int) -> Any:
-    """Return a JAX array as it is, or another as doubles; raise ValueError unless its last axis is `last` long.
+    """Return coordinates of shape (..., last): a JAX array as it is, which may be traced, anything else as doubles.
 
     NaN stands for a missing coordinate and is allowed. `name`: what the array is called in errors.
+
+    Raises:
+        ValueError: an array whose last axis has another length, or one that is no array of numbers.
     """
     if isinstance(value, jax.Array):
         coordinates = value

@@ -70,7 +70,10 @@ def discretize(
 
 
 class ContinuousSystem(Module):
-    """Matrices of dx = (A x + B u) dt + dW with the intensity S of W."""
+    """Matrices A (n, n) and B (n, inputs) of dx = (A x + B u) dt + dW, and the intensity S (n, n) of W.
+
+    The intensity is the covariance that W gains in a unit of time.
+    """
 
     a: Array
     b: Array
@@ -82,86 +85,111 @@ class ContinuousSystem(Module):
         The model is dx = (A x + B u) dt + dW, where W gains the covariance S in a unit of time; Q is the integral of
         exp(A s) S exp(A s)' over the step. Series over a short step h = dt / 2^count are doubled `count` times.
         """
-        # The 1-norm of A dt says how short the short step has to be.
-        xp = library(self.a, self.b, self.intensity, dt)
+        xp = library(self.a, self.b, self.intensity, dt)  # NumPy, or JAX's for traced numbers
         a = xp.asarray(self.a)
+        # The short step has |A| h <= 1/2 in the 1-norm, for which the series converge fast.
         size = xp.max(xp.sum(xp.abs(a), axis=0)) * dt
-        # |A| h <= 1/2.
         count = xp.ceil(xp.log2(xp.maximum(2 * size, 1.0)))
         short = dt / 2**count
         integral, noise = self._integrate_short_step(xp, a, short)
-        growth = a @ integral
-        # F - I, F, the integral of F, and Q, doubled: by a loop of fixed length where `count` is traced.
-        parts = growth, np.eye(len(a)) + growth, integral, noise
-        if is_traced(parts, count):
-            parts = jax.lax.fori_loop(0, HALVINGS, _make_masked_doubling(count), parts)
+        growth = a @ integral  # F - I = A times the integral of F
+        step = StepOfSystem(growth=growth, matrix=np.eye(len(a)) + growth, integral=integral, noise=noise)
+        # Doubled `count` times: by a loop of fixed length where `count` is traced.
+        if is_traced(step, count):
+            step = jax.lax.fori_loop(0, HALVINGS, _make_masked_doubling(count), step)
         else:
             for _ in range(int(count)):
-                parts = _double_step(*parts)
-        growth, squared, integral, noise = parts
+                step = _double_step(step)
         # There are two answers for F. I + (F - I) loses numbers small beside 1, while the squared F is off by 2^count
         # roundings of itself: it is the better one where F is small enough.
-        decayed = xp.max(xp.abs(squared)) * 2**count < 1
-        matrix = xp.where(decayed, squared, np.eye(len(a)) + growth)
-        return Discretized(matrix, (noise + noise.T) / 2, integral @ self.b)
+        decayed = xp.max(xp.abs(step.matrix)) * 2**count < 1
+        matrix = xp.where(decayed, step.matrix, np.eye(len(a)) + step.growth)
+        return Discretized(matrix, (step.noise + step.noise.T) / 2, step.integral @ self.b)
 
     def _integrate_short_step(self, xp: Any, a: Any, h: Any) -> tuple[Any, Any]:
-        """Return the integral of exp(A s), and that of exp(A s) S exp(A s)', over a short step h."""
+        """Return the integral of exp(A s), and that of exp(A s) S exp(A s)', over s from 0 to a short step h.
+
+        Both are summed as series of TERMS + 1 terms. `xp` is the module of arrays, NumPy or JAX's, and `a` is A.
+        """
 
         def add_term(k: Any, parts: tuple[Any, ...]) -> tuple[Any, ...]:
-            """Return the terms of order k of both series, and the sums with these terms.
+            """Return the terms of order k of both series, and the sums with these terms, from `parts`, those of k - 1.
 
             The first series is the integral of exp(A s) from 0 to h, with terms h^k A^(k-1) / k!. The second is the
-            integral of exp(A s) S exp(A s)'. `a` is A, and h the length of the step.
+            integral of exp(A s) S exp(A s)', with terms T_k = (h / k) (A T_k-1 + T_k-1 A').
             """
             integral_term, noise_term, integral, noise = parts
-            integral_term, half = a @ integral_term * (h / k), a @ noise_term * (h / k)
+            integral_term = a @ integral_term * (h / k)
+            half = a @ noise_term * (h / k)
             noise_term = half + half.T
             return integral_term, noise_term, integral + integral_term, noise + noise_term
 
-        power, spread = h * xp.eye(len(a)), h * xp.asarray(self.intensity)
-        parts = power, spread, power, spread
+        # The terms of order 1, h I and h S, which are the sums so far too.
+        first_integral_term, first_noise_term = h * xp.eye(len(a)), h * xp.asarray(self.intensity)
+        parts = first_integral_term, first_noise_term, first_integral_term, first_noise_term
         if is_traced(parts):
             parts = jax.lax.fori_loop(2, TERMS + 2, add_term, parts)
         else:
             for k in range(2, TERMS + 2):
                 parts = add_term(k, parts)
-        return parts[2], parts[3]
+        _integral_term, _noise_term, integral, noise = parts
+        return integral, noise
 
 
-def _double_step(growth: Any, matrix: Any, integral: Any, noise: Any) -> tuple[Any, Any, Any, Any]:
-    """Return F - I, F, the integral of F, and Q over twice the step, from the same over the step.
+class StepOfSystem(NamedTuple):
+    """A step of dx = A x dt + dW, all matrices (n, n), NumPy's or JAX's.
 
-    `growth`: F - I. F(2h) = F F, F(2h) - I = 2 (F - I) + (F - I)^2, integral(2h) = 2 integral + (F - I) integral, and
+    Args:
+        growth: F - I, which keeps digits that F loses where the step is short.
+        matrix: F = exp(A h).
+        integral: the integral of exp(A s) over the step.
+        noise: Q, the integral of exp(A s) S exp(A s)'.
+    """
+
+    growth: Any
+    matrix: Any
+    integral: Any
+    noise: Any
+
+
+def _double_step(step: StepOfSystem) -> StepOfSystem:
+    """Return the matrices of twice a step h from those of the step.
+
+    F(2h) = F F, F(2h) - I = 2 (F - I) + (F - I)^2, integral(2h) = 2 integral + (F - I) integral, and
     Q(2h) = Q + F Q F'.
     """
-    matrix_times_noise = noise + growth @ noise  # F Q
-    return (
-        2 * growth + growth @ growth,
-        matrix @ matrix,
-        2 * integral + growth @ integral,
-        noise + matrix_times_noise + matrix_times_noise @ growth.T,
+    growth, F, integral, Q = step
+    FQ = Q + growth @ Q
+    return StepOfSystem(
+        growth=2 * growth + growth @ growth,
+        matrix=F @ F,
+        integral=2 * integral + growth @ integral,
+        noise=Q + FQ + FQ @ growth.T,  # F Q F' = F Q + F Q (F - I)'
     )
 
 
-def _make_masked_doubling(count: Any) -> Callable[[Any, tuple[Any, ...]], tuple[Any, ...]]:
+def _make_masked_doubling(count: Any) -> Callable[[Any, StepOfSystem], StepOfSystem]:
     """Return the body of a loop that doubles a step in its first `count` turns and then leaves it unchanged.
 
     A compiled loop has a fixed number of turns, while `count` may be traced.
     """
 
-    def double_up_to_count(i: Any, matrices: tuple[Any, ...]) -> tuple[Any, ...]:
+    def double_up_to_count(i: Any, step: StepOfSystem) -> StepOfSystem:
         """Return the matrices of twice the step in turn i of the loop if i is below `count`, else the given ones."""
         # Double zeros after the last turn, so that nothing overflows and derivatives stay finite.
         goes_on = i < count
-        doubled = _double_step(*(jnp.where(goes_on, matrix, 0.0) for matrix in matrices))
-        return tuple(jnp.where(goes_on, new, old) for new, old in zip(doubled, matrices, strict=True))
+        step_or_zeros = StepOfSystem(*(jnp.where(goes_on, matrix, 0.0) for matrix in step))
+        doubled = _double_step(step_or_zeros)
+        return StepOfSystem(*(jnp.where(goes_on, new, old) for new, old in zip(doubled, step, strict=True)))
 
     return double_up_to_count
 
 
 def _read_continuous_matrices(A: ArrayLike, intensity: ArrayLike, B: ArrayLike | None) -> ContinuousSystem:
-    """Return A (n, n), B (n, inputs) and the noise intensity (n, n), checked, as one system; B None has no columns."""
+    """Return A (n, n), B (n, inputs) and the noise intensity (n, n) as one system, after a check of their shapes.
+
+    An intensity may be a number, a variance for each state. Where B is None there are no inputs.
+    """
     a = array("matrix of the motion", A, (None, None))
     n = a.shape[0]
     a = array("matrix of the motion", a, (n, n))
@@ -170,29 +198,32 @@ def _read_continuous_matrices(A: ArrayLike, intensity: ArrayLike, B: ArrayLike |
 
 
 class TransitionOverStep(Module):
-    """F of the step that an input says; `place` is that of dt among the inputs."""
+    """Transition matrix F = exp(A dt) as a function of the inputs u, one of which is the length dt of the step.
+
+    `place` is the index of dt in u.
+    """
 
     model: ContinuousSystem
     place: int = eqx.field(static=True)
 
     def __call__(self, u: jax.Array) -> jax.Array:
-        """Return F (n, n)."""
+        """Return F (n, n) for the step length among the inputs u."""
         return jnp.asarray(self.model.discretize_over(u[self.place]).matrix)
 
 
 class NoiseOverStep(TransitionOverStep):
-    """Q of the step that an input says."""
+    """Noise covariance Q as a function of the inputs u, one of which is the length dt of the step."""
 
     def __call__(self, u: jax.Array) -> jax.Array:
-        """Return Q (n, n)."""
+        """Return Q (n, n) for the step length among the inputs u."""
         return jnp.asarray(self.model.discretize_over(u[self.place]).noise)
 
 
 class InputMatrixOverStep(TransitionOverStep):
-    """Matrix of inputs that are held over the step that the last of them says."""
+    """Input matrix (integral of exp(A s)) B as a function of the inputs u, whose last is the length dt of the step."""
 
     def __call__(self, u: jax.Array) -> jax.Array:
-        """Return the matrix (n, inputs + 1), zero for dt."""
+        """Return the matrix (n, inputs + 1) for the step length in u; its last column, that of dt, is zero."""
         matrix = jnp.asarray(self.model.discretize_over(u[self.place]).input_matrix)
         return jnp.concatenate([matrix, jnp.zeros((len(matrix), 1))], axis=1)
 

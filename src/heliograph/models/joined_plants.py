@@ -28,8 +28,8 @@ class TransitionSideBySide(Module):
     """Transition of several plants, each with its own part of the state and its own inputs.
 
     Args:
-        plants: the plants.
-        places: of each plant's inputs among all.
+        plants: the plants, whose states stand one after another in x.
+        places: for each plant, the indices of its own inputs among the inputs u of all.
     """
 
     plants: tuple[AbstractPlant, ...]
@@ -46,7 +46,7 @@ class TransitionSideBySide(Module):
 
 
 class MatrixSideBySide(TransitionSideBySide):
-    """The block-diagonal matrix of linear plants."""
+    """The block-diagonal matrix A of linear plants side by side, as a function of the inputs u of all."""
 
     def __call__(self, u: jax.Array) -> jax.Array:  # type: ignore[override]
         """Return A (n, n) of the joint state under the inputs u of all plants, with the plants' own on the diagonal."""
@@ -57,15 +57,17 @@ class MatrixSideBySide(TransitionSideBySide):
 
 
 class InputsSideBySide(TransitionSideBySide):
-    """The input matrices of linear plants, one above the other."""
+    """The input matrix B of linear plants side by side, one plant's rows above the next, as a function of u."""
 
     def __call__(self, u: jax.Array) -> jax.Array:  # type: ignore[override]
         """Return B (n, inputs) under the inputs u; a plant's rows are zero except in the columns of its own inputs."""
-        rows, plants = [], list[Any](self.plants)  # linear ones
+        rows_of_plants = []
+        plants: list[Any] = list(self.plants)  # linear ones
         for plant, own_inputs, columns in zip(plants, split_inputs(u, self.places), self.places, strict=True):
             matrix = jnp.asarray(matrix_under_inputs(plant.input_matrix, own_inputs))
-            rows.append(jnp.zeros((len(plant.states), len(u))).at[:, np.array(columns, int)].set(matrix))
-        return jnp.concatenate(rows)
+            no_inputs = jnp.zeros((len(plant.states), len(u)))
+            rows_of_plants.append(no_inputs.at[:, np.array(columns, int)].set(matrix))
+        return jnp.concatenate(rows_of_plants)
 
 
 def join(plants: "Sequence[AbstractPlant]") -> LinearPlant | Plant:
@@ -110,12 +112,12 @@ def join(plants: "Sequence[AbstractPlant]") -> LinearPlant | Plant:
 
 
 def _join_starts(parts: list[Any]) -> tuple[Any, Any]:
-    """Return initial mean and initial law of several plants' joint state, the arguments of the joint plant.
+    """Return initial mean and initial law of several plants' joint state, as arguments of the joint plant.
 
-    The joint state stacks the states of the plants. If all starts are known, x_0 = center + d: the joint law is that of
-    the independent deviations d of the plants, and the center is E[x_0] - E[d], since a law may have a mean of its own.
-    If the start of some states is unknown (a diffuse prior), the law is a `DiffuseStart`: the names of these states,
-    with the block-diagonal covariance of all others.
+    The joint state stacks the states of the plants, `parts`. If all starts are known, x_0 = center + d: the joint law
+    is that of the independent deviations d of the plants, and the center is E[x_0] - E[d], since a law may have a mean
+    of its own. If the start of some states is unknown (a diffuse prior), the law is a `DiffuseStart`: the names of
+    these states, with the block-diagonal covariance of all others.
 
     Raises:
         ValueError: some start is unknown, and another plant's law of x_0 is not Gaussian.

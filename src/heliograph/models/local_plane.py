@@ -45,14 +45,14 @@ class LocalPlane(Module):
     height: float = eqx.field(static=True)
 
     def __init__(self, latitude: ArrayLike, longitude: ArrayLike, height: ArrayLike = 0.0):
-        """Check and hold the origin: latitude and longitude in degrees, and metres above the ellipsoid."""
+        """Check and hold the origin: latitude and longitude in degrees, and its height in metres over the ellipsoid."""
         self.latitude = float(scalar("latitude of a local plane", latitude, -90.0, 90.0))
         self.longitude = float(scalar("longitude of a local plane", longitude, -360.0, 360.0))
         self.height = float(scalar("height of a local plane", height, -1e4, 1e9))
 
     @property
     def _origin(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the origin's distance from the axis and height over the equator's plane, as arrays."""
+        """Return the origin's distance from the earth's axis and its height over the equator's plane, in metres."""
         return _locate_on_meridian(np.radians(self.latitude), self.height)
 
     def to_plane(self, latitude: ArrayLike, longitude: ArrayLike, height: ArrayLike) -> Float[np.ndarray, "*points 3"]:
@@ -66,8 +66,10 @@ class LocalPlane(Module):
         Raises:
             ValueError: shapes that do not fit, or a latitude beyond 90 degrees (perhaps a longitude).
         """
-        phi, turn, rise = self._subtract_origin(latitude, longitude, height)  # relative to the origin
-        radius, _ = self._origin  # r_0: its distance from the earth's axis
+        # Differences to the origin of latitude, longitude (radians) and height; of the distance from the earth's axis,
+        # r - r_0, and of the height over the equator's plane, z - z_0.
+        phi, turn, rise = self._subtract_origin(latitude, longitude, height)
+        radius, _ = self._origin  # r_0
         across, along = _subtract_on_meridian(np.radians(self.latitude), self.height, phi, rise)
         # Turn by the difference l in longitude: r cos l - r_0 = (r - r_0) - 2 r sin^2(l / 2), which loses no digits.
         out = across - 2 * (radius + across) * np.sin(turn / 2) ** 2
@@ -152,7 +154,16 @@ class LocalPlane(Module):
     def _subtract_origin(
         self, latitude: ArrayLike, longitude: ArrayLike, height: ArrayLike
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return latitude and longitude (radians, from -pi to pi) and height of points, minus the origin's."""
+        """Return latitude and longitude (radians, from -pi to pi) and height of points, minus the origin's.
+
+        Args:
+            latitude: of the points, in degrees.
+            longitude: in degrees.
+            height: in metres.
+
+        Raises:
+            ValueError: shapes that do not fit, or a latitude beyond 90 degrees.
+        """
         named = {"latitude": latitude, "longitude": longitude, "height": height}
         values = [_read_coordinates(f"{name} of points", value) for name, value in named.items()]
         try:
@@ -166,7 +177,13 @@ class LocalPlane(Module):
         return np.radians(phi - self.latitude), np.radians(_wrap_degrees(turn - self.longitude)), rise - self.height
 
     def _from_meridian(self, east: np.ndarray, out: np.ndarray, along: np.ndarray) -> np.ndarray:
-        """Return east, north, up of what is east, out of the earth's axis and along it, seen from the origin."""
+        """Return east, north and up (..., 3) of points given in other axes: the inverse of `_to_meridian`.
+
+        Args:
+            east: metres east of the origin.
+            out: metres farther from the earth's axis than the origin, in the plane of its meridian.
+            along: metres along the earth's axis.
+        """
         c, s = np.cos(np.radians(self.latitude)), np.sin(np.radians(self.latitude))
         return np.stack([east, c * along - s * out, c * out + s * along], axis=-1)
 
@@ -201,7 +218,13 @@ class LocalPlane(Module):
 
 
 def _read_coordinates(name: str, value: ArrayLike, *last: int) -> np.ndarray:
-    """Return an array whose last axes have the lengths `last`, after any leading axes; NaN stands for missing."""
+    """Return coordinates as an array (..., *last): any leading axes, and last axes of given lengths.
+
+    NaN stands for a missing coordinate. `name` is what the array is called in errors.
+
+    Raises:
+        ValueError: another shape, or no array of numbers.
+    """
     try:
         leading_axes = max(np.ndim(value) - len(last), 0)
     except ValueError:  # rows of different lengths, which the check names
@@ -243,7 +266,7 @@ def _subtract_on_meridian(
     latitude, middle = origin + phi, origin + phi / 2
     sine_change = 2 * np.cos(middle) * np.sin(phi / 2)  # sin lat - sin lat_0
     cosine_change = -2 * np.sin(middle) * np.sin(phi / 2)  # cos lat - cos lat_0
-    # w and N at the origin (index 0) and at the point.
+    # w and N at the origin (w_0, N_0) and at the point.
     w_0 = np.sqrt(1 - SQUARED_ECCENTRICITY * np.sin(origin) ** 2)
     w = np.sqrt(1 - SQUARED_ECCENTRICITY * np.sin(latitude) ** 2)
     N_0 = SEMI_MAJOR / w_0
@@ -261,8 +284,10 @@ def _subtract_on_meridian(
 def _find_latitude_by_bowring(r: np.ndarray, z: np.ndarray) -> np.ndarray:
     """Return an approximate latitude (radians) by Bowring's formula.
 
-    r: metres from the earth's axis. z: metres above the plane of the equator. beta: the parametric latitude, estimated
-    from the point's direction.
+    It is where Newton's method begins. With the ellipsoid's axes a and b, e^2 its eccentricity squared and
+    e'^2 = e^2 / (1 - e^2), tan lat = (z + e'^2 b sin^3 beta) / (r - e^2 a cos^3 beta), where beta is the parametric
+    latitude, estimated from the point's direction. r: metres from the earth's axis. z: metres above the plane of the
+    equator.
     """
     axis_ratio = 1 - FLATTENING  # b / a
     distance = np.hypot(r, z)

@@ -102,9 +102,8 @@ def singer(
     size, rate = _read_deviation_and_rate(deviation, time)
     motion = library(rate).asarray([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, -rate]])
     start = library(size).asarray([WIDE, WIDE, size**2])
-    return _repeat_on_axes(
-        motion, _make_intensity(3, 2 * size**2 * rate), axes, dt, initial_mean, initial_covariance, start
-    )
+    intensity = _make_intensity(order=3, value=2 * size**2 * rate)  # of the acceleration alone
+    return _repeat_on_axes(motion, intensity, axes, dt, initial_mean, initial_covariance, start)
 
 
 def gauss_markov(
@@ -170,7 +169,7 @@ def known_turn(
     named = read_two_axes(axes)
     mean = np.zeros(4) if initial_mean is None else initial_mean
     start = WIDE * np.eye(4) if initial_covariance is None else initial_covariance
-    states = _keep_units(_name_states(named, 2))
+    states = _keep_units(_name_states(named, order=2))  # a position and a velocity for each axis
     return continuous_plant(motion, q * np.diag([0.0, 1.0, 0.0, 1.0]), mean, start, dt=dt, states=states)
 
 
@@ -187,12 +186,16 @@ def read_two_axes(axes: Names) -> list[str]:
 
 
 def _read_deviation_and_rate(deviation: ArrayLike, time: ArrayLike) -> tuple[Any, Any]:
-    """Return a deviation, checked, and the rate 1 / time at which it is forgotten."""
+    """Return a standard deviation, and the rate 1 / T of a process whose autocorrelation is exp(-t / T), T = `time`.
+
+    Raises:
+        ValueError: a negative deviation, or a time that is not positive.
+    """
     return scalar("deviation", deviation, 0.0, LARGEST), 1 / scalar("time", time, 1 / LARGEST)
 
 
 def _make_intensity(order: int, value: ArrayLike) -> Any:
-    """Return the intensity of noise that enters the last of so many states."""
+    """Return the intensity (order, order) of a noise of variance `value` per unit of time on the last state alone."""
     q = scalar("noise intensity", value, 0.0)
     return q * np.diag([0.0] * (order - 1) + [1.0])
 
@@ -211,7 +214,7 @@ def _name_states(axes: Sequence[str], order: int) -> list[str]:
 
 
 def _keep_units(states: Sequence[str]) -> Sequence[str]:
-    """Return names whose units, where they have some, stay with them."""
+    """Return the names of states, each as a name that carries its unit, if it had one when the user gave it."""
     return [rename(name, str(name)) for name in states]
 
 
@@ -224,9 +227,10 @@ def _repeat_on_axes(
     initial_covariance: NoiseLike | None,
     start: Any = None,
 ) -> LinearPlant:
-    """Return the plant of the same motion dx = A x dt + dW on each axis, independently.
+    """Return the plant of the same motion dx = A x dt + dW on each axis, independently of the others.
 
-    `order` is the number of states of one axis: position, velocity and so on.
+    An axis has `order` states: its position, velocity and so on. The plant's states are those of all axes, axis by
+    axis.
 
     Args:
         motion: A (order, order) of one axis.

@@ -23,7 +23,7 @@ Weights = TypeAliasType("Weights", Mapping[str, Float[ArrayLike, "..."]])
 
 @runtime_checkable
 class HasMeans(Protocol):
-    """What a filter or smoother returns of rows of data."""
+    """What a filter or smoother returns of rows of data: means (steps, n), covariances (steps, n, n), their claim."""
 
     means: np.ndarray
     covariances: np.ndarray
@@ -32,7 +32,7 @@ class HasMeans(Protocol):
 
 @runtime_checkable
 class HasMean(Protocol):
-    """An estimate, of one time or of several, or the states of a forecast."""
+    """An estimate, of one time or of several, or the states of a forecast: mean (..., n), covariance (..., n, n)."""
 
     mean: np.ndarray
     covariance: np.ndarray
@@ -58,7 +58,7 @@ class Components:
 
     @property
     def deviation(self) -> Float[np.ndarray, "steps m"]:
-        """Claimed standard deviations (steps, m)."""
+        """Standard deviations (steps, m) of the errors, roots of the claimed variances; NaN where none is claimed."""
         variances = np.diagonal(self.covariance, axis1=-2, axis2=-1)
         return np.asarray(np.sqrt(np.maximum(variances, 0.0)))
 
@@ -137,11 +137,11 @@ def components(source: HasMeans | HasMean, weights: Weights) -> Components:
     if not named:
         raise fail("weights", "at least one combination", "none")
     # Combination j has the weights w_j: the mean w_j' m, and the covariance w_i' P w_j of two of them.
-    each = [_read_weights(name, value, mean) for name, value in named.items()]
-    rows = np.stack(each, axis=-2)
-    combined = np.einsum("...mn,...n->...m", rows, mean)
-    spread = np.einsum("...mi,...ij,...kj->...mk", rows, covariance, rows)
-    return Components(tuple(named), combined, spread, source.claim)
+    weights_by_combination = [_read_weights(name, value, mean) for name, value in named.items()]
+    W = np.stack(weights_by_combination, axis=-2)  # (..., m, n)
+    combined_mean = np.einsum("...mn,...n->...m", W, mean)
+    combined_covariance = np.einsum("...mi,...ij,...kj->...mk", W, covariance, W)
+    return Components(tuple(named), combined_mean, combined_covariance, source.claim)
 
 
 def _read_weights(name: str, value: ArrayLike, mean: np.ndarray) -> np.ndarray:

@@ -18,22 +18,25 @@ from heliograph.random_affine.noises.noise import NoiseLike
 
 
 class DriftAndStepLength(Module):
-    """dx/dt = f(x, u), and the length of a step: a number, or the last input."""
+    """dx/dt = f(x, u), and the length of a step: a number `dt`, or the last input where `dt` is None.
+
+    `substeps` is the number of Runge-Kutta steps that a step is cut into.
+    """
 
     drift: Drift
     dt: Any
     substeps: int = eqx.field(static=True)
 
     def split(self, u: jax.Array) -> tuple[jax.Array, Any]:
-        """Return the inputs of f, and the length of the step."""
+        """Return the inputs of the drift f, and the length of the step, which is the last of u where `dt` is None."""
         return (u, self.dt) if self.dt is not None else (u[:-1], u[-1])
 
 
 class RungeKuttaStep(DriftAndStepLength):
-    """The classical step of Runge and Kutta: local error of order dt^5."""
+    """Transition x+ of dx/dt = f(x, u) by the classical step of Runge and Kutta: local error of order dt^5."""
 
     def __call__(self, x: jax.Array, u: jax.Array) -> jax.Array:
-        """Return the state after a step."""
+        """Return the state (n,) after a step from x, under inputs u that are held over the step."""
         inputs, dt = self.split(u)
         h = dt / self.substeps
 

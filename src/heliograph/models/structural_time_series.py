@@ -21,18 +21,19 @@ from heliograph.random_affine.noises.noise import NoiseLike
 
 
 class SumOfComponents(Module):
-    """The matrix of a sensor that measures a sum of states, some times an input.
+    """The matrix of a sensor that measures a weighted sum of states; weights may be multiplied by inputs.
 
     Args:
         weights: of the states (n,).
-        places: place of each state's input among the sensor's, None of one that has none.
+        places: for each state, the index of the input by which its weight is multiplied (as for a coefficient of a
+            regression), or None.
     """
 
     weights: Array
     places: tuple[int | None, ...] = eqx.field(static=True)
 
     def __call__(self, u: jax.Array) -> jax.Array:
-        """Return the matrix (1, n)."""
+        """Return the sensor's matrix (1, n), the weights of the states under the inputs u (inputs,)."""
         return jnp.asarray(self.rows(jnp.asarray(u))[None])
 
     def rows(self, u: Any) -> Any:
@@ -89,20 +90,24 @@ class Structural(Module):
         found: dict[str, Any] = {}
         # Each component has states of its own; all others get the weight 0.
         for part, at in zip(self.parts, _find_state_places(self.parts), strict=True):
-            every = np.zeros((*(() if u is None else (len(u),)), len(self.plant.states)))
-            every[..., at] = part.loading if u is None else _make_component_weights(part, names).rows(u)
-            found[part.name] = every
+            rows = () if u is None else (len(u),)  # one row of weights, or one for each row of inputs
+            weights_of_all = np.zeros((*rows, len(self.plant.states)))
+            weights_of_all[..., at] = part.loading if u is None else _make_component_weights(part, names).rows(u)
+            found[part.name] = weights_of_all
         return found
 
 
 def _find_state_places(parts: Sequence[Component]) -> list[slice]:
-    """Return the places of each component's states among all."""
+    """Return where each component's states stand among the states of all, which follow one another."""
     ends = np.cumsum([0, *(len(part.plant.states) for part in parts)]).tolist()
     return [slice(start, end) for start, end in pairwise(ends)]
 
 
 def _make_component_weights(part: Component, names: Sequence[str]) -> SumOfComponents:
-    """Return the weights of a component's states under inputs of these names."""
+    """Return the weights of a component's states as a function of inputs that have these `names`, in their order.
+
+    Those of a regression are multiplied by its inputs, all others are constant.
+    """
     places = tuple(list(names).index(name) for name in part.inputs) if part.inputs else (None,) * len(part.loading)
     return SumOfComponents(part.loading, places)
 

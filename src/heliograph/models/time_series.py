@@ -38,8 +38,10 @@ class Component(Module):
     inputs: tuple[str, ...] = eqx.field(static=True)
 
     def __init__(self, name: str, plant: LinearPlant, loading: "Float[ArrayLike, ' n']", inputs: Sequence[str] = ()):
-        """Check and hold the name, the plant, the weights of its states and, of a regression, its inputs."""
+        """Check and hold a component of a series: `loading` @ (states of the plant).
 
+        `inputs`: for a regression, the input by which each state's weight is multiplied; none of all others.
+        """
         self.name = text("name of a component", name)
         self.plant = instance("plant of a component", plant, LinearPlant, "a LinearPlant")
         self.loading = array("loading of a component", loading, (len(plant.states),))
@@ -180,12 +182,17 @@ def trigonometric_seasonal(
         raise fail("harmonics", f"from 1 to {most}, which differ at whole steps", count)
     # For each wave a block of the plant's matrix, its two states, and the weight of each state in the observed sum.
     q, start = scalar("variance of the season", variance, 0.0), _read_initial_variance(initial_variance)
-    named, blocks, states, loading = text("name of a component", name), [], [], []
+    named = text("name of a component", name)
+    blocks, states, loading = [], [], []
     for j in range(1, count + 1):
-        alone = 2 * j == length  # cos(pi t), of which the shifted wave is 0: one state
-        blocks.append(np.array([[-1.0]]) if alone else _make_rotation(2 * np.pi * j / length))
-        states += [f"{named}_{j}"] if alone else [f"{named}_{j}", f"{named}_{j}_shifted"]
-        loading += [1.0] if alone else [1.0, 0.0]
+        if 2 * j == length:  # cos(pi t), of which the shifted wave is 0: one state
+            blocks.append(np.array([[-1.0]]))
+            states.append(f"{named}_{j}")
+            loading.append(1.0)
+        else:
+            blocks.append(_make_rotation(2 * np.pi * j / length))
+            states += [f"{named}_{j}", f"{named}_{j}_shifted"]
+            loading += [1.0, 0.0]
     plant = LinearPlant(block_diagonal(blocks), q, np.zeros(len(states)), start, states=states)
     return Component(named, plant, loading)
 
@@ -242,7 +249,8 @@ def arma(
 
     Source: Harvey, Forecasting, structural time series models and the Kalman filter (1989), 3.3 and 4.1.3.
     """
-    # Harvey's state: the present value, and the known parts of later ones; the first column of F has the coefficients.
+    # Harvey's state: the present value, and the known parts of later ones. F = [phi, [I; 0]]: the first column has the
+    # autoregression's coefficients, the others move each part one place up.
     phi, theta = array("ar", ar, (None,)), array("ma", ma, (None,))
     q = scalar("variance of the noise", variance, 0.0)
     size = max(len(phi), len(theta) + 1)
@@ -311,6 +319,7 @@ def stationary(x: "Float[ArrayLike, ' p']") -> Any:
     partial = numbers / xp.sqrt(1 + numbers**2)
     coefficients = partial[:0]  # order 0 has no coefficients
     for k in range(len(partial)):
+        # phi_k+1,j = phi_k,j - r phi_k,k+1-j for j <= k, and the new one, r, the partial autocorrelation of this order.
         coefficients = xp.concatenate([coefficients - partial[k] * coefficients[::-1], partial[k : k + 1]])
     return coefficients
 
@@ -328,18 +337,22 @@ def stationary_covariance(matrix: Any, noise: Any) -> Any:
 
 
 def _read_initial_variance(variance: "ArrayLike | DiffuseStart") -> Any:
-    """Return the variance of states before the first step, checked; or `hg.diffuse`."""
+    """Return the variance of states before the first step as a number, or `hg.diffuse`, where nothing is known.
+
+    Raises:
+        ValueError: a negative variance.
+    """
     return variance if isinstance(variance, DiffuseStart) else scalar("initial variance", variance, 0.0)
 
 
 def _make_rotation(angle: Any) -> Any:
-    """Return the matrix (2, 2) that turns a wave's pair of states by an angle."""
+    """Return the matrix [[cos, sin], [-sin, cos]] that turns a wave's pair of states by an angle in radians."""
     xp = library(angle)
     c, s = xp.cos(angle), xp.sin(angle)
     return xp.stack([xp.stack([c, s]), xp.stack([-s, c])])
 
 
 def _make_diagonal(variances: list[Any]) -> Any:
-    """Return the diagonal matrix of variances, some of which may be traced."""
+    """Return the diagonal matrix of variances, of NumPy's or, where some are traced by JAX, of JAX's arrays."""
     xp = library(variances)
     return xp.diag(xp.stack([xp.asarray(value) for value in variances]))

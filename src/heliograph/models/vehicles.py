@@ -17,12 +17,12 @@ NEAR = 1e-4  # radians: below this, series take the place of quotients, right to
 
 
 class StepLength(Module):
-    """The length of a step: a number, or the last input."""
+    """A part of a plant that depends on the length of a step: a number `dt`, or the last input where `dt` is None."""
 
     dt: Any
 
     def length(self, u: jax.Array) -> Any:
-        """Return the length of the step under the input u."""
+        """Return the length of the step: `dt` if it is given, else the last of the inputs u."""
         return u[-1] if self.dt is None else self.dt
 
 
@@ -35,10 +35,11 @@ class TurnMotion(StepLength):
         w: the turn rate; `self.length(u)`: the step's length, given or an input.
         """
         dt = self.length(u)
-        angle = x[4] * dt
+        px, vx, py, vy, rate = x
+        angle = rate * dt
+        # The integral of the turning velocity over the step: `along` v + `across` (v turned by 90 degrees).
         along, across = dt * sine_ratio(angle), dt * cosine_ratio(angle)
         c, s = jnp.cos(angle), jnp.sin(angle)
-        px, vx, py, vy, rate = x
         return jnp.stack(
             [px + along * vx - across * vy, c * vx - s * vy, py + across * vx + along * vy, s * vx + c * vy, rate]
         )
@@ -77,19 +78,19 @@ class ArcMotion(StepLength):
         dt, speed = self.length(u), u[0]
         rate = u[1] if self.wheelbase is None else speed * jnp.tan(u[1]) / self.wheelbase
         half_turn = rate * dt / 2
-        chord = speed * dt * sine_ratio(half_turn)
+        chord = speed * dt * sine_ratio(half_turn)  # an arc of length s = speed dt and angle 2 a: s sin(a) / a
         direction = x[2] + half_turn
         change = jnp.stack([chord * jnp.cos(direction), chord * jnp.sin(direction), rate * dt])
         return jnp.asarray(x + change)
 
 
 class NoiseTimesStep(StepLength):
-    """Q = S dt."""
+    """Covariance Q = S dt of a step's noise, with the intensity S (n, n): the covariance gained in a unit of time."""
 
     intensity: Array
 
     def __call__(self, u: jax.Array) -> jax.Array:
-        """Return Q (n, n)."""
+        """Return Q (n, n) of the step whose length is `dt`, or the last of the inputs u."""
         return jnp.asarray(jnp.asarray(self.intensity) * self.length(u))
 
 

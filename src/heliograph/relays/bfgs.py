@@ -61,7 +61,7 @@ class _DenseInverseHessian:
     """Inverse Hessian H as a matrix, first a small multiple of I and then scaled by the first update."""
 
     def __init__(self, gradient: np.ndarray):
-        """Begin with H = I / (10 |gradient|), so that the first step has length 1/10."""
+        """Begin with H = I / (10 |gradient|), so that the first step, -H gradient, has length 1/10."""
         self.matrix = np.eye(len(gradient)) * 0.1 / max(np.linalg.norm(gradient), np.finfo(float).tiny)
         self.is_first_update = True
 
@@ -80,9 +80,10 @@ class _DenseInverseHessian:
 
         H: the inverse Hessian, `self.matrix`. H+ = (I - s y'/s'y) H (I - y s'/s'y) + s s'/s'y.
         """
-        curvature, is_first = float(s @ y), self.is_first_update
+        curvature = float(s @ y)
+        is_first = self.is_first_update
         self.is_first_update = False
-        if curvature <= CURVED * np.linalg.norm(s) * np.linalg.norm(y):
+        if curvature <= CURVED * np.linalg.norm(s) * np.linalg.norm(y):  # not positive beyond rounding
             return
         if is_first:  # the first H was a guess; the step has shown the curvature, so H begins as I s'y / y'y
             self.matrix = np.eye(len(s)) * curvature / float(y @ y)
@@ -98,10 +99,11 @@ class _LimitedInverseHessian:
         self.updates: deque[tuple[np.ndarray, np.ndarray]] = deque(maxlen=memory)
 
     def times(self, vector: np.ndarray) -> np.ndarray:
-        """Return H v by two loops over the updates, newest first and then oldest first.
+        """Return H v of a `vector` v by two loops over the updates, newest first and then oldest first (L-BFGS).
 
-        `self.updates`: pairs (s, y) of a step and of the change of the gradient over it, the newest last.
-        H = V'H_before V + s s'/s'y with V = I - y s'/s'y, and H = I s'y/y'y (of the newest) before the oldest.
+        `self.updates`: pairs (s, y) of a step and of the change of the gradient over it, the newest last. An update
+        makes H = V'H_before V + s s'/s'y with V = I - y s'/s'y; before the oldest, H = I s'y/y'y with the newest
+        pair. The first loop applies the matrices V to v, the second V' and s s'/s'y. Without updates H = I.
         """
         v, weights = vector, []
         for s, y in reversed(self.updates):
@@ -116,7 +118,10 @@ class _LimitedInverseHessian:
         return v
 
     def update(self, s: np.ndarray, y: np.ndarray) -> None:
-        """Remember an update whose curvature s'y is positive."""
+        """Remember a step s and its change y of the gradient, if the curvature s'y is positive beyond rounding.
+
+        The oldest update is dropped where `memory` of them are kept already.
+        """
         if s @ y > CURVED_OF_MANY * np.linalg.norm(s) * np.linalg.norm(y):
             self.updates.append((s, y))
 
@@ -126,9 +131,18 @@ def _backtrack(
 ) -> tuple[np.ndarray, float, np.ndarray] | None:
     """Shorten the step from x along `direction` until the value is finite and falls enough (Armijo's rule).
 
-    The value must fall by at least the share DECREASE of what the slope promises. `slope` is direction' gradient at x.
-    Else the length, 1 at first, is multiplied by SHORTEN. Returns the step, and value and gradient at its end; None if
-    no length from SHORTEST on will do.
+    The length is 1 at first, and is multiplied by SHORTEN until the value falls by at least the share DECREASE of what
+    the slope promises.
+
+    Args:
+        function: from x to its value and gradient.
+        x: where the step begins.
+        value: that of the function at x.
+        direction: of the step.
+        slope: direction' gradient at x.
+
+    Returns:
+        The step, and value and gradient at its end; None if no length from SHORTEST on will do.
     """
     length = 1.0
     while length >= SHORTEST:

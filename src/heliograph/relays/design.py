@@ -71,7 +71,7 @@ _propagate = compile_in_float64(propagate_error_moments)
 
 
 def initial_error_covariance(network: RelayNetwork) -> Float[np.ndarray, "d d"]:
-    """Return the covariance of (x_0, e_1 .. e_F)."""
+    """Return the covariance of (x_0, e_1 .. e_F), where each of the F filters starts at E x_0: e_f = x_0 - E x_0."""
     return initial_error_moments(network.initial()[1], len(network.filters))
 
 
@@ -84,10 +84,11 @@ def join_gains(network: RelayNetwork, gains: GainsByFilter) -> Float[np.ndarray,
         raise fail("gains", f"those of {list(network.filters)}", list(gains))
     n, first = len(network.states), network.filters[0]
     length = len(array(f"gains of {first!r}", gains[first], (None, None, None)))
-    joined, start = np.zeros((length, len(network.filters) * n, sum(network.received))), 0
+    joined = np.zeros((length, len(network.filters) * n, sum(network.received)))
+    start = 0  # column of the filter's first received number
     for f, (name, size) in enumerate(zip(network.filters, network.received, strict=True)):
-        value = array(f"gains of {name!r}", gains[name], (length, n, size))
-        joined[:, f * n : (f + 1) * n, start : start + size] = value
+        rows, columns = slice(f * n, (f + 1) * n), slice(start, start + size)
+        joined[:, rows, columns] = array(f"gains of {name!r}", gains[name], (length, n, size))
         start += size
     return joined
 
@@ -95,7 +96,10 @@ def join_gains(network: RelayNetwork, gains: GainsByFilter) -> Float[np.ndarray,
 def split_gains(
     network: RelayNetwork, joined: Float[np.ndarray, "steps Fn R"]
 ) -> dict[str, Float[np.ndarray, "steps n _"]]:
-    """Return the gains by filter from block matrices for each step: the inverse of `join_gains`."""
+    """Return the gains (steps, n, received) of each filter from block matrices: the inverse of `join_gains`.
+
+    Rows of a block matrix are by filter and state, columns are the R received numbers, by filter.
+    """
     n, ends = len(network.states), np.cumsum(network.received)
     return {
         name: np.asarray(joined)[:, f * n : (f + 1) * n, end - size : end]
@@ -104,12 +108,16 @@ def split_gains(
 
 
 def make_design(network: RelayNetwork, propagated: PropagatedMoments) -> RelayDesign:
-    """Return the design with the propagated gains and moments; raise ValueError unless all moments are finite."""
+    """Return the design of a network from its gains, moments and powers over time, taken apart by filter.
+
+    Raises:
+        ValueError: moments that are not finite.
+    """
     moments, n = np.asarray(propagated.moments), len(network.states)
     if not np.all(np.isfinite(moments)):
         step = int(np.argmax(~np.isfinite(moments).all(axis=(1, 2))))
         raise fail("design", "finite second moments", f"some that are not after step {step} (is a link noiseless?)")
-    # The moments are of (x, e_1 .. e_F), e_f the error of filter f. The power is by sender, of which the first is y's.
+    # The moments are of (x, e_1 .. e_F), e_f the error of filter f. Power is by sender: the sensor, then the relays.
     blocks = {name: slice((1 + f) * n, (2 + f) * n) for f, name in enumerate(network.filters)}
     return RelayDesign(
         gains=split_gains(network, np.asarray(propagated.gains)),
@@ -139,13 +147,16 @@ def relay_schedules(network: RelayNetwork, design: RelayDesign) -> dict[str, Sch
         raise fail("design", f"filters {list(network.filters)}", list(design.gains))
     _check_start(network, design)
     steps = network.steps(len(design.moments) - 1)
-    # Predicted moments of (x, e_1 ... e_F, innovations); d is the size of (x, e_1 ... e_F), errors before correction.
-    predicted, d = np.asarray(_predict_covariances(steps, design.moments[:-1])), design.moments.shape[-1]
+    # Covariances of (x, e_1 .. e_F, innovations) at each step, with the errors before their correction. The first d
+    # entries are (x, e_1 .. e_F), and the innovations stand filter after filter.
+    predicted = np.asarray(_predict_covariances(steps, design.moments[:-1]))
+    d = design.moments.shape[-1]
     n, ends = len(network.states), np.cumsum(network.received)
     start_mean, _start_covariance = network.initial()
     schedules = {}
     for f, (name, size) in enumerate(zip(network.filters, network.received, strict=True)):
-        received, error = slice(ends[f] - size, ends[f]), slice((1 + f) * n, (2 + f) * n)
+        received = slice(ends[f] - size, ends[f])  # the filter's own, of all received numbers
+        error = slice((1 + f) * n, (2 + f) * n)  # its error e_f, after x and the filters before it
         gains = _make_gains(
             steps,
             design.gains[name],
@@ -201,7 +212,8 @@ def _make_gains(
 def _check_start(network: RelayNetwork, design: RelayDesign) -> None:
     """Raise ValueError if the design's moments at k = 0 are not those of the network's start.
 
-    A periodic design fails this check. It has one step for each slot, and ends with the moments with which it begins.
+    A filter that runs from the start cannot use the gains of another start. A periodic design fails this check: it has
+    one step for each slot, and ends with the moments with which it begins; the message then says so.
     """
     # The start is compared to rounding. A periodic design was found by iteration, so its ends agree less closely.
     expected, start = initial_error_covariance(network), design.moments[0]
@@ -214,9 +226,10 @@ def _check_start(network: RelayNetwork, design: RelayDesign) -> None:
 
 @compile_in_float64
 def _predict_covariances(steps: RelaySteps, moments: Float[Array, "time d d"]) -> Float[Array, "time z z"]:
-    """Return at each step the covariance of state, errors of all F filters before corrections, and R innovations.
+    """Return at each step the covariance of (x, e_1 .. e_F before corrections, the R innovations), of size z = d + R.
 
-    `moments` (d, d): of the state and the errors before the step; the result has size z = d + R.
+    x is the state and e_f the error of filter f. `moments` are the covariances (d, d) of (x, e_1 .. e_F) before each of
+    the network's `steps`.
     """
     return jax.vmap(lambda step, covariance: step_moments(step, covariance)[0])(steps, moments)
 
@@ -224,7 +237,8 @@ def _predict_covariances(steps: RelaySteps, moments: Float[Array, "time d d"]) -
 def make_receiver_cost(weights: Float[np.ndarray, "steps"], filters: int, n: int) -> Float[np.ndarray, "steps d d"]:
     """Return the matrices C_k of the cost, <C_k, moments_k> = weight_k tr P_k, P_k the receiver's error covariance.
 
-    <A, B> is the sum of A_ij B_ij. The moments are of (x, e_1 .. e_F), each of n entries; the receiver's error is last.
+    <A, B> is the sum of A_ij B_ij. The moments are of (x, e_1 .. e_F) with F = `filters`, each of n entries; the
+    receiver's error is last. `weights` are weight_k of each step.
     """
     d = (1 + filters) * n
     matrices = np.zeros((len(weights), d, d))
@@ -251,7 +265,13 @@ def local_error_design(network: RelayNetwork, horizon: int) -> RelayDesign:
 
 
 def relay_gains(network: RelayNetwork, gains: GainsByFilter) -> Float[np.ndarray, "steps Fn R"]:
-    """Return the block matrices (`join_gains`) of the relays' gains, zero for the receiver, which comes last."""
+    """Return the relays' gains as one block matrix for each step, with zeros for the receiver's gain.
+
+    Rows are by filter and state, columns are the R received numbers, by filter; the receiver's come last.
+
+    Raises:
+        ValueError: a network without relays, a relay without gains, gains of another shape.
+    """
     gains = table("relay gains", gains, "arrays")
     missing = [name for name in network.relays if name not in gains]
     if missing or not network.relays:

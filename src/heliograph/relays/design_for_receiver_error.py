@@ -28,7 +28,7 @@ from heliograph.relays.error_moments import (
 )
 from heliograph.relays.power_limit import PowerLimitedProblem, make_power_limit, minimise_within_limit
 
-STEPS = 4  # of a descent within a power limit, for each sweep
+QUASI_NEWTON_STEPS = 4  # of a descent within a power limit, for each sweep that the caller asks for
 
 
 def receiver_error_design(
@@ -40,10 +40,11 @@ def receiver_error_design(
 ) -> RelayDesign:
     """Design gains of relays and receiver that make sum_k weight_k tr P_k small, P_k the receiver's covariance.
 
-    The cost is quadratic in the gains of one step while the others stay: tr Lam_k [I -K] Z_k [I -K]', with moments Z
-    from the steps before and the gradient Lam of the cost to come. A sweep goes backward and then forward and
-    minimises exactly at each step, so the cost never rises; it starts from `local_error_design`. The result is a local
-    minimum, so an upper bound on the best.
+    The cost is quadratic in the gains K of one step k while those of other steps stay: tr Lam_k [I -K] Z_k [I -K]'.
+    Z_k is the covariance of (state and errors before the correction, innovations), which the steps before give, and
+    Lam_k the gradient of the cost of later steps by the covariance after step k. A sweep goes backward for Lam and then
+    forward for Z, and minimises exactly at each step, so the cost never rises; it starts from `local_error_design`. The
+    result is a local minimum, so an upper bound on the best.
 
     With a power limit the gains of all steps move at once, inside a logarithmic barrier that is lowered bit by bit, in
     four quasi-Newton steps for a sweep; the own-error design stays the result where it meets the limit and is better. A
@@ -69,14 +70,14 @@ def receiver_error_design(
         raise fail("weights and sweeps", "no negative weight and at least one sweep", f"{np.min(weights):g}, {sweeps}")
     steps, start = network.steps(horizon), initial_error_covariance(network)
     cost = make_receiver_cost(weights, len(network.filters), len(network.states))
-    # From the gains with which each filter minimises its own error.
+    # Both searches begin with the gains with which each filter minimises its own error.
     local_gains = join_gains(network, design.gains)
     if power_limit is None:
         gains = _alternate_sweeps(steps, start, cost, local_gains, np.arange(sweeps))
     else:
         limit = make_power_limit(steps, power_limit, start.shape[0])
         problem = PowerLimitedProblem(steps=steps, start=start, cost=cost, power=limit)
-        gains = minimise_within_limit(problem, local_gains, STEPS * sweeps)
+        gains = minimise_within_limit(problem, local_gains, QUASI_NEWTON_STEPS * sweeps)
     return given_design(network, split_gains(network, np.asarray(gains)))
 
 
@@ -91,7 +92,7 @@ def _sweep_backward(
     """
 
     def predict(moments: jax.Array, row: tuple[RelaySteps, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        """Return the moments after a step with its given gain, and those before the correction."""
+        """Return the moments after a step, to go on with, and before its correction; row: the step and its gain."""
         step, gain = row
         uncorrected, _ = step_moments(step, moments)
         return correct_moments(uncorrected, gain), uncorrected
@@ -99,9 +100,13 @@ def _sweep_backward(
     def step_back(
         later: jax.Array, row: tuple[RelaySteps, jax.Array, jax.Array, jax.Array]
     ) -> tuple[jax.Array, jax.Array]:
-        """Return the cost's gradient by the moments before a step, and Lam, its gradient by the moments after it."""
+        """Return the cost's gradient by the moments before a step, to go on with, and that by the moments after it.
+
+        `later` is the gradient of the cost of later steps by the moments after this one. A row has the step, its old
+        gain, the moments before the correction, and the matrix of the step's own cost.
+        """
         step, gain, uncorrected, own_cost = row
-        lam = later + own_cost  # of later steps' cost, and of the step's own
+        lam = later + own_cost  # the gradient by the moments after this step, of later steps' cost and its own
         best_gain = minimise_cost_ahead(uncorrected, lam, gain, step)
         return moment_adjoint(step, best_gain, lam), lam
 
@@ -111,27 +116,39 @@ def _sweep_backward(
     return lams
 
 
-def _sweep_forward(steps: RelaySteps, start: Array, gains: jax.Array, ahead: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Return the best gains for the gradients `ahead`, step by step from the first, and the moments after each step.
+def _sweep_forward(
+    steps: RelaySteps, start: Array, gains: jax.Array, gradients: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Return the best gains for given gradients of later cost, step by step from the first, and moments after steps.
 
-    `ahead` is the gradient of the cost by the moments after each step. `gains` are the old ones, which damp the change.
+    The moments are Cov(x, e_1 .. e_F), of the state and the filters' errors. Better gains at one step change the
+    moments, and so the best gains, of the next.
+
+    Args:
+        steps: the network's steps.
+        start: moments before the first step (d, d).
+        gains: the old gains (time, F n, R), which decide only entries on which the cost does not depend.
+        gradients: Lam, gradient of the cost by the moments after each step (time, d, d).
     """
 
     def improve_step(
         moments: jax.Array, row: tuple[RelaySteps, jax.Array, jax.Array]
     ) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
-        """Return the moments after a step with its best gain, and the pair (best gain, these moments) to collect."""
+        """Return the moments after a step with its best gain, and the pair (best gain, these moments) to collect.
+
+        `moments` are those before the step; a row has the step, its old gain, and the gradient of the cost.
+        """
         step, old_gain, gradient = row  # the gradient of the cost by the moments after the step
         uncorrected, _ = step_moments(step, moments)
         gain = minimise_cost_ahead(uncorrected, gradient, old_gain, step)
         corrected = correct_moments(uncorrected, gain)
         return corrected, (gain, corrected)
 
-    return jax.lax.scan(improve_step, jnp.asarray(start), (steps, gains, ahead))[1]
+    return jax.lax.scan(improve_step, jnp.asarray(start), (steps, gains, gradients))[1]
 
 
 class SweepState(NamedTuple):
-    """Gains of the sweep, and the best gains with their cost: rounding may raise it at the end."""
+    """Gains of the last sweep, and the best gains so far with their cost, which rounding may raise at the end."""
 
     gains: Float[jax.Array, "time Fn R"]
     best: Float[jax.Array, "time Fn R"]
@@ -153,7 +170,10 @@ def _alternate_sweeps(
     """
 
     def sweep(search: SweepState, _: jax.Array) -> tuple[SweepState, None]:
-        """Sweep backward and forward once; keep the best gains so far with their cost, sum_k <cost_k, moments_k>."""
+        """Return the search after one more sweep backward and forward, with the best gains so far and their cost.
+
+        The cost is sum_k <cost_k, covariance after step k>, <A, B> the sum of A_ij B_ij.
+        """
         gradients = _sweep_backward(steps, start, cost, search.gains)  # of the cost by the covariance after each step
         gains, moments = _sweep_forward(steps, start, search.gains, gradients)
         new_cost = jnp.sum(cost * moments)

@@ -19,7 +19,7 @@ from heliograph.numerics.types import Array, Bool, Float
 
 
 class SentMoments(NamedTuple):
-    """W = E (sent, 1)(sent, 1)' and each sender's power E |signal|^2, zero if silent."""
+    """W = E (sent, 1)(sent, 1)' of all T sent numbers and the constant 1; each sender's power E |signal|^2, or 0."""
 
     second: Float[jax.Array, "T+1 T+1"]
     power: Float[jax.Array, "senders"]
@@ -47,8 +47,9 @@ def make_error_step_maps(step: RelaySteps) -> ErrorStepMaps:
     x is the plant's state, e_f = x - s_f the error of filter f (relays first, the receiver last), w the process noise
     and v the sensor's. Each filter has some of the R received numbers: `step.owner` is the filter of each.
     """
-    (m, n), filters = step.sensing.shape, len(step.received)
-    d = (1 + filters) * n
+    m, n = step.sensing.shape
+    filters = len(step.received)
+    d = (1 + filters) * n  # numbers in (x, e_1 .. e_F)
     # Rows that select x, e_1 .. e_F, and the noises w and v.
     unit = jnp.eye(d + n + m)
     state, w, v = unit[:d].reshape(1 + filters, n, -1), unit[d : d + n], unit[d + n :]
@@ -62,7 +63,7 @@ def make_error_step_maps(step: RelaySteps) -> ErrorStepMaps:
     sent_by_estimate = [step.sensing @ step.transition, *[step.sensing] * (filters - 1)]
     prediction_matrix = jnp.asarray(step.gain) @ jnp.stack([jnp.asarray(c) for c in sent_by_estimate]).reshape(-1, n)
     predicted = jnp.einsum("rn,rnc->rc", prediction_matrix, estimates[step.owner])
-    innovation = jnp.asarray(step.gain) @ sent - predicted
+    innovation = jnp.asarray(step.gain) @ sent - predicted  # E[G] sent - prediction, constants left out
     return ErrorStepMaps(moved=moved.reshape(d, -1), innovation=innovation, sent=sent)
 
 
@@ -73,7 +74,8 @@ def sent_mean(step: RelaySteps) -> Float[jax.Array, "sent"]:
     that of C x whatever the gains are.
     """
     mean_of_y = step.sensing @ (step.transition @ step.state_mean + step.drift) + step.sensor_offset
-    mean_of_each_relay, relays = step.sensing @ step.state_mean, len(step.received) - 1
+    mean_of_each_relay = step.sensing @ step.state_mean
+    relays = len(step.received) - 1  # the receiver, the last filter, sends nothing
     return jnp.concatenate([mean_of_y, *[mean_of_each_relay] * relays, jnp.ones(1)])
 
 
@@ -86,7 +88,7 @@ def step_moments(step: RelaySteps, moments: Float[Array, "d d"]) -> tuple[Float[
     maps, mean = make_error_step_maps(step), sent_mean(step)
     # eta+, innovations and what is sent are linear maps of (x, e_1 .. e_F, w, v), of this covariance.
     sources = jax.scipy.linalg.block_diag(moments, step.process, step.sensor_noise)
-    # E (sent, 1)(sent, 1)' = mean mean' + Cov sent.
+    # E (sent, 1)(sent, 1)' = mean mean' + Cov sent; the last row and column are for the constant 1.
     second = jnp.outer(mean, mean).at[:-1, :-1].add(propagate_by_mode(maps.sent, sources, 0.0))
     # Random gains G add (G - E G) sent + n - E n to the innovations: the covariance is that of (G, n), in `step`,
     # contracted with the second moments of (sent, 1).
@@ -106,7 +108,7 @@ def correct_moments(z: Float[Array, "z z"], gain: Float[Array, "Fn R"]) -> Float
     of (eta+ before corrections, innovations).
     """
     rows, received = gain.shape
-    d = z.shape[0] - received
+    d = z.shape[0] - received  # size of eta
     identity, zeros_for_x = jnp.eye(d), jnp.zeros((d - rows, received))
     correction = jnp.concatenate([identity, jnp.concatenate([zeros_for_x, -gain])], axis=1)  # [I, -(0; K)]
     return symmetrize(propagate_by_mode(correction, z, 0.0))
@@ -133,7 +135,8 @@ def innovations_above_rounding(predicted: Float[jax.Array, "z z"], step: RelaySt
     difference of large numbers, of which the rounding remains. `predicted` is the covariance of (x, e_1 .. e_F,
     innovations), with x and each filter's error of n entries. ROUNDING is a few units in the last place.
     """
-    n, relays, d = step.transition.shape[-1], len(step.received) - 1, predicted.shape[0] - sum(step.received)
+    n, relays = step.transition.shape[-1], len(step.received) - 1
+    d = predicted.shape[0] - sum(step.received)  # numbers in (x, e_1 .. e_F)
     # Sizes of the numbers sent: |C| (deviation + |mean|) of x by the sensor, and of s_f = x - e_f by each relay.
     deviations = jnp.sqrt(jnp.maximum(jnp.diagonal(predicted)[:d], 0.0)).reshape(-1, n)  # rows: x, e_1 .. e_F
     size_of_state = deviations[0] + jnp.abs(step.state_mean)
@@ -148,7 +151,11 @@ def innovations_above_rounding(predicted: Float[jax.Array, "z z"], step: RelaySt
 
 
 def regression_gain(cross: Float[jax.Array, "n m"], received: Float[jax.Array, "m m"]) -> Float[jax.Array, "n m"]:
-    """Return K = Cov(e, i) Cov(i)^-1, which minimises tr Cov(e - K i); zero for what other innovations determine."""
+    """Return K = Cov(e, i) Cov(i)^-1, which minimises tr Cov(e - K i).
+
+    `cross` is Cov(e, i) and `received` Cov(i). Where Cov(i) is singular, K is zero for an innovation that others
+    determine.
+    """
     return psd_solve(received, cross.T).T
 
 
@@ -162,7 +169,8 @@ def local_gain(predicted: Float[jax.Array, "z z"], step: RelaySteps) -> Float[ja
     """
     n, received = step.transition.shape[-1], sum(step.received)
     d = predicted.shape[0] - received  # the innovations follow from index d
-    gain, start = jnp.zeros((d - n, received)), 0
+    gain = jnp.zeros((d - n, received))
+    start = 0  # index of the filter's first received number
     # 1 for an innovation that arrives in this slot and is more than rounding, else 0.
     is_informative = step.receives_in_slot * innovations_above_rounding(predicted, step)
     for f, length in enumerate(step.received):
@@ -177,7 +185,10 @@ def local_gain(predicted: Float[jax.Array, "z z"], step: RelaySteps) -> Float[ja
 
 
 class PropagatedMoments(NamedTuple):
-    """Gains, the covariance of eta before and after each step, and the power of each sender."""
+    """Gains of all filters, the covariance of eta = (x, e_1 .. e_F) before the first and after each step, and powers.
+
+    power: E |signal|^2 of each sender in each step, the sensor first; 0 for one that does not transmit.
+    """
 
     gains: Float[Array, "time Fn R"]
     moments: Float[Array, "time+1 d d"]
@@ -202,7 +213,8 @@ def propagate_error_moments(
     def move(moments: jax.Array, row: tuple[RelaySteps, jax.Array | None]) -> tuple[jax.Array, tuple[jax.Array, ...]]:
         """Return the covariance of eta after a step, and the triple (gains, this covariance, powers) to collect.
 
-        Where `gain` is None, each filter gets the gain that minimises its own error at this step.
+        `moments` is the covariance before the step; a row has the step and its gains. Where these are None, each filter
+        gets the gain that minimises its own error at this step.
         """
         step, gain = row
         uncorrected, sent = step_moments(step, moments)  # uncorrected: of (eta+ before corrections, innovations)
@@ -212,8 +224,8 @@ def propagate_error_moments(
 
     start = jnp.asarray(start)
     items = (steps, None if gains is None else jnp.asarray(gains))
-    _, (gains, moments, power) = jax.lax.scan(move, start, items)
-    return PropagatedMoments(gains, jnp.concatenate([start[None], moments]), power)
+    _last_moments, (all_gains, moments, power) = jax.lax.scan(move, start, items)
+    return PropagatedMoments(all_gains, jnp.concatenate([start[None], moments]), power)
 
 
 DAMPING = 1e-9  # relative, on the change of a gain: decides only what the receiver's error does not
@@ -281,7 +293,7 @@ def moment_adjoint(step: RelaySteps, gain: Float[Array, "Fn R"], ahead: Float[Ar
     """
 
     def step_covariance(p: jax.Array) -> jax.Array:
-        """Return P+ from P."""
+        """Return P+, the covariance after the step, from P before it."""
         return correct_moments(step_moments(step, p)[0], gain)
 
     _, pull_back = jax.vjp(step_covariance, jnp.zeros_like(ahead))

@@ -24,7 +24,7 @@ from heliograph.relays.design import (
     split_gains,
 )
 from heliograph.relays.error_moments import PropagatedMoments, correct_moments, propagate_error_moments, regression_gain
-from heliograph.relays.power_limited_descent import Cost, make_penalised_cost, minimise_over_gains
+from heliograph.relays.power_limited_descent import Cost, SteadyErrors, make_penalised_cost, minimise_over_gains
 from heliograph.relays.receiver import ReceiverViewOfRelays, make_receiver_view
 
 CONVERGED = 1e-13  # relative change of the moments over a period
@@ -51,6 +51,7 @@ def periodic_steps(network: RelayNetwork) -> RelaySteps:
     if radius >= 1:
         raise fail("steady state", "a plant with spectral radius below 1", f"{radius:.6g}")
     mean = np.linalg.solve(np.eye(len(network.states)) - steps.transition[0], steps.drift[0])
+    # The steps with E x = m before each in place of the mean that runs in from the start.
     steady_steps: RelaySteps = eqx.tree_at(lambda s: s.state_mean, steps, np.broadcast_to(mean, steps.state_mean.shape))
     return steady_steps
 
@@ -109,7 +110,7 @@ def periodic_behind_relays(network: RelayNetwork, gains: GainsByFilter) -> Float
 def _make_converging_steps(network: RelayNetwork, gains: Float[np.ndarray, "slots Fn R"]) -> RelaySteps:
     """Return the steps of one period, one for each slot; raise ValueError if moments diverge under these gains.
 
-    Moments converge if their linear map over a period has a spectral radius below 1.
+    Second moments follow an affine map over a period; they converge if its linear part has a spectral radius below 1.
     """
     check_gains_of_slots(network, gains)
     steps = periodic_steps(network)
@@ -120,13 +121,16 @@ def _make_converging_steps(network: RelayNetwork, gains: Float[np.ndarray, "slot
 
 
 def check_gains_of_slots(network: RelayNetwork, gains: Float[np.ndarray, "slots Fn R"]) -> None:
-    """Raise ValueError where there is not one gain for each slot."""
+    """Raise ValueError unless `gains` has one block matrix of all filters' gains for each slot of the schedule."""
     if len(gains) != len(network.slots):
         raise fail("periodic gains", f"one for each of the {len(network.slots)} slots", len(gains))
 
 
 def affine_fixed_point(step: Callable[[jax.Array], jax.Array], d: int) -> Float[jax.Array, "{d} {d}"]:
-    """Return M = step(M) for an affine map of symmetric (d, d) matrices."""
+    """Return M = step(M) for an affine map of symmetric (d, d) matrices, M -> constant + linear(M), by a linear solve.
+
+    The map is linearised at 0: its value there is the constant, its derivative there the linear part.
+    """
     constant, linear = jax.linearize(step, jnp.zeros((d, d)))
     return jnp.asarray(solve_fixed_point(jax.vmap(linear), constant))
 
@@ -138,7 +142,7 @@ def steady_moments(steps: RelaySteps, gains: Float[Array, "slots Fn R"]) -> Prop
     is the fixed point of this map, and is differentiable in the gains. If the moments diverge, there is a fixed point
     too, but it is no covariance (`is_covariance`).
     """
-    d = gains.shape[1] + steps.transition.shape[-1]
+    d = gains.shape[1] + steps.transition.shape[-1]  # F n for the errors, and n for x
     start = affine_fixed_point(lambda m: propagate_error_moments(steps, m, gains).moments[-1], d)
     return propagate_error_moments(steps, start, gains)
 
@@ -156,40 +160,42 @@ def is_covariance(moments: Float[Array, "... d d"]) -> Bool[jax.Array, ""]:
 def steady_receiver_covariance(steps: RelaySteps, gains: Float[Array, "slots Fn R"]) -> Float[jax.Array, "slots d d"]:
     """Return the steady error covariances of the best linear estimate of (x, e_relays) from the receiver's data.
 
-    They are those at the end of each slot of a period. The receiver's gains are held while differentiating: they
-    minimise the error, so their change has no first-order effect, and the fixed point with given gains is affine.
+    In each slot the receiver observes zeta+ = A zeta + noise, z = C zeta + noise with zeta = (x, e_relays) (d,). The
+    result has the covariances of zeta - its estimate at the end of each slot of a period. The receiver's gains are held
+    while differentiating: they minimise the error, so their change has no first-order effect, and the fixed point with
+    given gains is affine.
 
     Args:
         steps: of one period.
         gains: of all filters as one block matrix for each slot; those of the receiver are not used.
     """
     moments = steady_moments(steps, gains).moments[:-1]
-    sides = jax.vmap(make_receiver_view)(steps, moments, gains)
-    d = sides.transition.shape[-1]
+    views = jax.vmap(make_receiver_view)(steps, moments, gains)
+    d = views.transition.shape[-1]
 
-    def predict(covariance: jax.Array, side: ReceiverViewOfRelays) -> jax.Array:
-        """Return the covariance of (x, e_relays) and z after a slot, before the correction."""
-        both = jnp.concatenate([side.transition, side.output])
-        return jnp.asarray(propagate_by_mode(both, covariance, side.noise))
+    def predict(covariance: jax.Array, view: ReceiverViewOfRelays) -> jax.Array:
+        """Return the error covariance [A; C] P [A; C]' + Cov noise of (zeta+, z), before the correction."""
+        both = jnp.concatenate([view.transition, view.output])
+        return jnp.asarray(propagate_by_mode(both, covariance, view.noise))
 
-    def correct_best(covariance: jax.Array, side: ReceiverViewOfRelays) -> tuple[jax.Array, jax.Array]:
-        """Take one Riccati step: return the covariance of (x, e_relays) after a slot, and the receiver's best gain."""
-        joint = predict(covariance, side)  # with the measurement, before the correction
+    def correct_best(covariance: jax.Array, view: ReceiverViewOfRelays) -> tuple[jax.Array, jax.Array]:
+        """Take one Riccati step: return the error covariance of zeta after a slot, and the receiver's best gain."""
+        joint = predict(covariance, view)  # with the measurement, before the correction
         gain = regression_gain(joint[:d, d:], joint[d:, d:])  # zero in a slot without data for the receiver
         return correct_moments(joint, gain), gain
 
     def correct_with(covariance: jax.Array, row: tuple[ReceiverViewOfRelays, jax.Array]) -> tuple[jax.Array, jax.Array]:
         """Take one step with a given gain: return the covariance after a slot twice, to go on with and to collect."""
-        side, gain = row  # `side`: the system of (x, e_relays) that the receiver sees in the slot
-        corrected = correct_moments(predict(covariance, side), gain)
+        view, gain = row
+        corrected = correct_moments(predict(covariance, view), gain)
         return corrected, corrected
 
     # The receiver's steady gains: its Riccati recursion over periods, without derivatives.
-    constant_sides = jax.lax.stop_gradient(sides)
+    constant_views = jax.lax.stop_gradient(views)
 
     def run_best_period(covariance: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return the covariance at the end of a period, and the best gain of each of its slots."""
-        return jax.lax.scan(correct_best, covariance, constant_sides)
+        return jax.lax.scan(correct_best, covariance, constant_views)
 
     start = jax.lax.stop_gradient(moments[0][:d, :d])
     steady_start, _ = _repeat_until_steady(lambda e: run_best_period(e)[0], start, GAINS_CONVERGED)
@@ -198,7 +204,7 @@ def steady_receiver_covariance(steps: RelaySteps, gains: Float[Array, "slots Fn 
     # With these gains the fixed point is one linear solve.
     def run_period(covariance: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return the covariances at the end of a period, and of each of its slots."""
-        return jax.lax.scan(correct_with, covariance, (sides, best_gains))
+        return jax.lax.scan(correct_with, covariance, (views, best_gains))
 
     _, covariances = run_period(affine_fixed_point(lambda e: run_period(e)[0], d))
     return jnp.asarray(covariances)
@@ -212,7 +218,9 @@ _steady_behind = compile_in_float64(steady_receiver_covariance)
 def _period_operator(steps: RelaySteps, gains: Float[Array, "slots Fn R"]) -> Float[jax.Array, "e e"]:
     """Return the linear part of the map of second moments over one period, a matrix on the entries of a triangle.
 
-    The map is affine, so it may be linearised anywhere, here at 0. Its spectral radius says whether moments converge.
+    The moments are Cov(x, e_1 .. e_F), of the state and all filters' errors; a symmetric matrix is given by the e
+    entries of its upper triangle. The map is affine, so it may be linearised anywhere, here at 0. Its spectral radius
+    says whether moments converge under these `gains`, one block matrix for each of the period's `steps`.
     """
     d = gains.shape[1] + steps.transition.shape[-1]
     _, linear = jax.linearize(lambda m: propagate_error_moments(steps, m, gains).moments[-1], jnp.zeros((d, d)))
@@ -243,18 +251,25 @@ def _iterate_local_design(
 def _repeat_until_steady(
     period: Callable[[jax.Array], jax.Array], start: jax.Array, tolerance: float
 ) -> tuple[jax.Array, jax.Array]:
-    """Repeat a period until its relative change is below `tolerance`; return the last value and its change."""
+    """Repeat a period until its relative change is below `tolerance`; return the last value and its change.
+
+    Args:
+        period: from the covariance before a period to that after it.
+        start: the covariance before the first.
+        tolerance: on the change of a covariance over a period, relative to its largest entry. After PERIODS periods the
+            last value is returned whatever its change is.
+    """
 
     def repeat(carry: RepeatedPeriods) -> RepeatedPeriods:
         """Return the value after one more `period`, its change (relative to its largest entry), and their count."""
-        value, _change_before, count = carry
+        value, _change_before, count = carry  # a matrix, its last change, and the number of periods so far
         value_after = period(value)
         size = jnp.maximum(jnp.max(jnp.abs(value_after)), np.finfo(float).tiny)
         change = jnp.max(jnp.abs(value_after - value)) / size
         return value_after, change, count + 1
 
     def changes(carry: RepeatedPeriods) -> jax.Array:
-        """Return whether the last change is above the tolerance, and periods are left."""
+        """Return whether to repeat once more: the last change is above the tolerance, and periods are left."""
         _, change, count = carry
         return (change > tolerance) & (count < PERIODS)
 
@@ -325,17 +340,24 @@ def _tune_gains(
     cost: Cost,
     power_limit: ArrayLike | None,
 ) -> Float[np.ndarray, "slots Fn R"]:
-    """Return the gains of least cost near `start`, which must have one block matrix for each slot.
+    """Return the gains of least cost that a descent from `start` finds, for the periodic steady state.
 
-    `free` is True for the received numbers whose gains may change. `cost` computes the cost of gains, with the penalty
-    of power.
+    Args:
+        network: the relay network, which varies with its slots only.
+        start: gains of all filters, one block matrix for each slot.
+        free: True for the received numbers whose gains may change.
+        cost: the cost of gains, with a penalty of power.
+        power_limit: of all relays together in each slot; None for no limit.
+
+    Raises:
+        ValueError: what `periodic_steps` and `minimise_over_gains` refuse, another number of gains than slots.
     """
     steps = periodic_steps(network)
     check_gains_of_slots(network, start)
     return minimise_over_gains(network, steps, start, free, cost, power_limit)
 
 
-def _trace_receiver_errors(steps: RelaySteps, gains: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _trace_receiver_errors(steps: RelaySteps, gains: jax.Array) -> SteadyErrors:
     """Return tr P of the receiver in the steady state by slot, whether errors converge to it, and the relays' powers.
 
     P is the receiver's error covariance after a slot, with the `gains` of relays and receiver. Errors converge if the
@@ -346,10 +368,12 @@ def _trace_receiver_errors(steps: RelaySteps, gains: jax.Array) -> tuple[jax.Arr
     # receiver's error.
     receiver = steady.moments[1:, -n:, -n:]
     relay_powers = jnp.sum(steady.power[:, 1:], axis=1)  # sender 0 is the sensor
-    return jnp.trace(receiver, axis1=1, axis2=2), is_covariance(steady.moments), relay_powers
+    return SteadyErrors(
+        traces=jnp.trace(receiver, axis1=1, axis2=2), converge=is_covariance(steady.moments), power=relay_powers
+    )
 
 
-def _trace_best_receiver_errors(steps: RelaySteps, gains: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _trace_best_receiver_errors(steps: RelaySteps, gains: jax.Array) -> SteadyErrors:
     """Return tr P of the best receiver in the steady state by slot, whether errors converge, and the relays' powers.
 
     P is the error covariance of the best linear estimate from what the receiver gets, behind relays with these `gains`.
@@ -360,7 +384,8 @@ def _trace_best_receiver_errors(steps: RelaySteps, gains: jax.Array) -> tuple[ja
     # The last n entries of each covariance are left out: they are of a receiver with its part of `gains`.
     do_converge = is_covariance(steady.moments[:, :-n, :-n]) & is_covariance(covariance)
     relay_powers = jnp.sum(steady.power[:, 1:], axis=1)  # sender 0 is the sensor
-    return jnp.trace(covariance[:, :n, :n], axis1=1, axis2=2), do_converge, relay_powers
+    traces = jnp.trace(covariance[:, :n, :n], axis1=1, axis2=2)  # of x, which stands before the relays' errors
+    return SteadyErrors(traces=traces, converge=do_converge, power=relay_powers)
 
 
 _receiver_cost = make_penalised_cost(_trace_receiver_errors)

@@ -31,9 +31,11 @@ PRECISION = 1e-8  # of the cost at the start: five iterations in a row that gain
 
 
 class PowerLimit(NamedTuple):
-    """Each step's gains must keep <form_k, moments after the step> below limit_k: the power of the next step.
+    """Each step's gains must keep <form_k, moments after step k> below limit_k, <A, B> the sum of A_ij B_ij.
 
-    Both without the power of the mean state, which every unbiased estimate sends; a step before silence has form 0.
+    The moments are Cov(x, e_1 .. e_F), of the state and the filters' errors; what relays send at step k + 1 are
+    estimates of step k. Form and limit leave out the power of the mean state, which every unbiased estimate sends. The
+    form is 0 where no relay sends at the next step.
     """
 
     form: Float[Array, "*time d d"]
@@ -41,7 +43,10 @@ class PowerLimit(NamedTuple):
 
 
 class PowerLimitedProblem(NamedTuple):
-    """Minimise sum_k <cost_k, moments after step k> within a power limit, from the moments `start`."""
+    """Minimise sum_k <cost_k, moments after step k> within a power limit, from the moments `start` before the first.
+
+    The moments are Cov(x, e_1 .. e_F) (d, d), of the state and the errors of all filters; <A, B> = sum of A_ij B_ij.
+    """
 
     steps: RelaySteps
     start: Float[Array, "d d"]
@@ -52,7 +57,13 @@ class PowerLimitedProblem(NamedTuple):
 def make_power_limit(steps: RelaySteps, value: ArrayLike, d: int) -> PowerLimit:
     """Return a limit `value` on the power of all relays together at each step as one on Cov(x, e_1 .. e_F) (d, d).
 
-    <form_k, covariance after step k> <= limit_k limits what relays send at step k + 1.
+    <form_k, covariance after step k> <= limit_k limits what relays send at step k + 1, as they send estimates of the
+    step before.
+
+    Args:
+        steps: the network's steps.
+        value: the limit, a number or one for each step.
+        d: length of (x, e_1 .. e_F), the state and all filters' errors.
 
     Raises:
         ValueError: a limit below what the mean state takes.
@@ -78,7 +89,8 @@ def make_power_limit(steps: RelaySteps, value: ArrayLike, d: int) -> PowerLimit:
 def make_power_matrices(steps: RelaySteps, d: int) -> Float[np.ndarray, "time {d} {d}"]:
     """Return form_k: <form_k, moments before step k> is the sum over the transmitting relays of tr Cov(C s_r).
 
-    <A, B> = tr A' B. Relay r sends C s_r of its estimate s_r. `d` is the size of the moments.
+    <A, B> = tr A' B. Relay r sends C s_r of its estimate s_r = x - e_r, at those of the network's `steps` at which it
+    transmits. The moments are Cov(x, e_1 .. e_F) (d, d), of the state and all filters' errors.
     """
     time, n = steps.state_mean.shape
     forms = np.zeros((time, d, d))
@@ -114,8 +126,9 @@ def minimise_within_limit(
         units = np.asarray(_choose_step_units(problem, gains, barrier))
         evaluate = partial(_evaluate_barrier, problem, gains, units, barrier)
         shape = units.shape[:2]
-        x0, steps_of_descent = np.zeros(math.prod(shape)), -(-iterations // len(BARRIERS))
-        x = bfgs(evaluate, start=x0, iterations=steps_of_descent, tolerance=PRECISION, memory=MEMORY)
+        steps_of_descent = math.ceil(iterations / len(BARRIERS))
+        no_change = np.zeros(math.prod(shape))
+        x = bfgs(evaluate, start=no_change, iterations=steps_of_descent, tolerance=PRECISION, memory=MEMORY)
         designs.append(np.asarray(_change_gains(gains, units, x.reshape(shape), problem.steps)))
     # The cheapest that meets all limits, without those at which a descent overflowed.
     judged = [_compute_cost_and_slack(problem, gains) for gains in designs]
@@ -129,7 +142,11 @@ def minimise_within_limit(
 def _scale_into_limit(
     problem: PowerLimitedProblem, local_gains: Float[np.ndarray, "time Fn R"]
 ) -> Float[np.ndarray, "time Fn R"]:
-    """Scale the relays' gains by one factor so that ROOM of the limit is left; without gains all of it is."""
+    """Return the gains with the relays' scaled by one factor, at most 1, so that the share ROOM of each limit is free.
+
+    Without gains relays send the mean state alone, and all of the limit is free: so a factor exists, found by bisection
+    in HALVINGS steps. A descent with a logarithmic barrier needs such a start inside the limits.
+    """
     relay_rows = local_gains.shape[1] - problem.steps.transition.shape[-1]  # without the receiver's, the last
 
     def scale_relays(factor: float) -> np.ndarray:
@@ -139,9 +156,10 @@ def _scale_into_limit(
     low, high = 0.0, 2.0  # the first middle is 1, the gains as they are
     for _ in range(HALVINGS):
         middle = (low + high) / 2
-        if np.min(_compute_cost_and_slack(problem, scale_relays(middle))[1]) < ROOM:
+        _cost, free_shares = _compute_cost_and_slack(problem, scale_relays(middle))
+        if np.min(free_shares) < ROOM:
             high = middle
-        elif middle == 1.0:
+        elif middle == 1.0:  # the gains as they are leave room
             return local_gains
         else:
             low = middle
@@ -152,7 +170,7 @@ def _scale_into_limit(
 def _compute_cost_and_slack(
     problem: PowerLimitedProblem, gains: Float[Array, "time Fn R"]
 ) -> tuple[Float[Array, ""], Float[Array, "time"]]:
-    """Return the cost of given gains, and the share of each step's power limit that they leave free.
+    """Return the cost of given gains in a `problem`, and the share of each step's power limit that they leave free.
 
     With <A, B> = sum of A_ij B_ij: the cost is sum_k <cost_k, moments after step k>, and the power <form_k, the same>.
     """
@@ -167,7 +185,8 @@ def _change_gains(
 ) -> Float[Array, "time Fn R"]:
     """Return the gains with their r free entries changed by units_k x_k at each step k; x is (time, r).
 
-    An entry is free if it multiplies what its filter receives (`gain_mask`). All other entries are always zero.
+    An entry is free if it multiplies what its filter receives itself (`gain_mask`, the same at all `steps`). All other
+    entries are always zero. Column j of units_k is the change of the free entries for one unit of x_kj.
     """
     rows, columns = np.nonzero(gain_mask(steps))
     return jnp.asarray(gains).at[:, rows, columns].add(jnp.einsum("kij,kj->ki", units, x))
@@ -181,7 +200,11 @@ def _compute_cost_with_barrier(
     barrier: float,
     x: Array,
 ) -> tuple[Float[Array, ""], Float[Array, "time r"]]:
-    """Return the cost and barrier at gains moved by x, infinite outside the limit, and its gradient."""
+    """Return the cost and barrier at gains moved by x, infinite outside the limit, and its gradient by x (time, r).
+
+    The gains are those of `_change_gains`: x changes the r free entries of each step in `units`. `barrier` is the
+    weight t of -log(free share of a power limit), summed over the steps.
+    """
 
     def value(x: jax.Array) -> jax.Array:
         """Return cost - barrier sum log(slack) at gains moved by x, `slack` the free share of each power limit.
@@ -206,8 +229,14 @@ def _evaluate_barrier(
 ) -> tuple[float, Float[np.ndarray, "variables"]]:
     """Return cost - barrier sum log(slack) and its gradient at one vector x, as a descent needs it.
 
-    slack_k is the free share of the power limit at step k. x has r numbers x_k for each step; they change its r free
-    gains by units_k x_k.
+    slack_k is the free share of the power limit at step k.
+
+    Args:
+        problem: the relays' steps, the cost, and the limits on their powers.
+        gains: gains that x changes (time, F n, R).
+        units: units_k (time, r, r): x_k changes the r free gains of step k by units_k x_k.
+        barrier: weight of the logarithm.
+        x: all x_k, one after another (time r,).
     """
     value, gradient = _compute_cost_with_barrier(problem, gains, units, barrier, x.reshape(units.shape[:2]))
     return float(value), np.asarray(gradient).ravel()
@@ -232,7 +261,11 @@ def _choose_step_units(
     def step_back(
         later: jax.Array, row: tuple[RelaySteps, jax.Array, jax.Array, jax.Array]
     ) -> tuple[jax.Array, jax.Array]:
-        """Return the cost's gradient by the moments before a step, and the units in which the step's gains change."""
+        """Return the cost's gradient by the moments before a step, and the units in which the step's gains change.
+
+        `later` is the gradient of the cost of later steps by the moments after this one. A row has the step, its gain,
+        the moments before it, and the gradient of its own cost and barrier by the moments after it.
+        """
         step, gain, moments_before, gradient_of_step = row
         # Lam, the gradient by the moments after the step: of the cost of later steps, and of this step's own.
         lam = later + gradient_of_step

@@ -1,7 +1,7 @@
 """Descent over the gains of a relay network's period, with the power of each slot kept below a limit."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -20,8 +20,44 @@ MARGIN = 1e-5  # the search aims this much below a limit, so that what is left o
 ROUNDS = 10  # of the multipliers
 STIFFNESS = 1000.0  # of the augmented Lagrangian, against a cost that is a logarithm
 
-# value, gradient and power of gains base + x unit at `where`, from x, steps, base, where, unit, limit, multipliers
-Cost = Callable[[Array, RelaySteps, Array, tuple[Array, ...], Array, Array, Array], tuple[Array, Array, Array]]
+
+class FreeGains(NamedTuple):
+    """Gains of a period with n free entries x: base, and base + x unit at the free entries.
+
+    Args:
+        steps: the network's steps of one period.
+        base: gains of all filters that x changes, one block matrix for each slot.
+        where: indices of the free entries in `base`, one array of indices (n,) for each of its three axes.
+        unit: the size in which each free entry is measured (n,).
+    """
+
+    steps: RelaySteps
+    base: Float[Array, "slots Fn R"]
+    where: tuple[Array, ...]
+    unit: Float[Array, "n"]
+
+
+class CostOfGains(NamedTuple):
+    """Cost of gains, its gradient by the free entries x, and the relays' power in each slot."""
+
+    value: Float[Array, ""]
+    gradient: Float[Array, "n"]
+    power: Float[Array, "slots"]
+
+
+class SteadyErrors(NamedTuple):
+    """tr P of the receiver in each slot, whether errors converge to this P, and the relays' power in each slot."""
+
+    traces: Float[jax.Array, "slots"]
+    converge: Bool[jax.Array, ""]
+    power: Float[jax.Array, "slots"]
+
+
+class Cost(Protocol):
+    """Cost of gains as a function of their free entries x, penalised where a slot's power exceeds its limit."""
+
+    def __call__(self, x: Array, gains: FreeGains, limit: Array, multipliers: Array) -> CostOfGains:
+        """Return the cost at x (n,) under power limits (slots,), with the multipliers lambda (slots,) of these."""
 
 
 def minimise_over_gains(
@@ -48,24 +84,28 @@ def minimise_over_gains(
     Raises:
         ValueError: gains at the start under which moments diverge; a limit that no gains were found to meet.
     """
-    # The entries that may change; the variables x are their changes in units of their filter's largest entry.
-    where = np.nonzero(gain_mask(steps) & (steps.receives_in_slot[:, None, :] > 0) & free)
+    # The entries that may change: a filter's own received numbers (`gain_mask`), which arrive in the slot, and are
+    # free. The variables x are their changes in units of their filter's largest entry.
+    is_free = gain_mask(steps) & (steps.receives_in_slot[:, None, :] > 0) & free  # (slots, F n, R)
+    where = np.nonzero(is_free)
     unit = _find_largest_entries(network, start)[where]
-    # A limit for each slot, without effect where no relay transmits. The search aims a margin below it.
+    gains = FreeGains(steps=steps, base=start, where=where, unit=unit)
+    # A limit for each slot, without effect where no relay transmits. The search aims a margin below it, since power
+    # ends a little above or below what is aimed at.
     slots = len(network.slots)
-    limit = np.full(slots, np.inf) if power_limit is None else repeat_per_step("power limit", power_limit, slots)
-    limit = np.where(steps.transmits_in_slot[:, 1:].any(axis=1), limit, np.inf)
+    no_limit = np.full(slots, np.inf)
+    limit = no_limit if power_limit is None else repeat_per_step("power limit", power_limit, slots)
+    some_relay_transmits = steps.transmits_in_slot[:, 1:].any(axis=1)  # sender 0 is the sensor
+    limit = np.where(some_relay_transmits, limit, np.inf)
     aimed_limit = limit * (1 - MARGIN)
     # lambda, a multiplier for the power of each slot.
     multipliers, x = np.zeros(slots), np.zeros(len(unit))
-    start_cost, _gradient, _power = cost(x, steps, start, where, unit, np.full(slots, np.inf), multipliers)
-    if not np.isfinite(start_cost):
+    if not np.isfinite(cost(x, gains, no_limit, multipliers).value):
         raise fail("start of the search", "gains under which second moments converge", "some under which they diverge")
     # Descend, then raise the multipliers of slots above their limit; once where there is no limit.
     for _ in range(ROUNDS if power_limit is not None else 1):
-        x = _descend(cost, x, (steps, start, where, unit, aimed_limit, multipliers))
-        _cost, _gradient, powers = cost(x, steps, start, where, unit, limit, multipliers)
-        power = np.asarray(powers)
+        x = _descend(cost, x, gains, aimed_limit, multipliers)
+        power = np.asarray(cost(x, gains, limit, multipliers).power)
         excess = power / aimed_limit - 1
         if _are_within_limits(excess, multipliers):
             break
@@ -77,22 +117,31 @@ def minimise_over_gains(
     return tuned
 
 
-def _descend(cost: Cost, x: Float[np.ndarray, "n"], arguments: tuple[Any, ...]) -> Float[np.ndarray, "n"]:
-    """Return the x of least cost, found by descent from x; `arguments` are those that the cost takes after x.
+def _descend(
+    cost: Cost,
+    start: Float[np.ndarray, "n"],
+    gains: FreeGains,
+    limit: Float[np.ndarray, "slots"],
+    multipliers: Float[np.ndarray, "slots"],
+) -> Float[np.ndarray, "n"]:
+    """Return the free entries x of the gains at which the cost has a local minimum, found by descent from `start`.
 
-    The cost returns its value, its gradient by x, and the power, which is not used here.
+    The power limits and their multipliers lambda stay as they are.
     """
 
     def evaluate(x: np.ndarray) -> tuple[float, np.ndarray]:
         """Return the cost of x, and its gradient."""
-        value, gradient, _power = cost(x, *arguments)
-        return float(value), np.asarray(gradient)
+        result = cost(x, gains, limit, multipliers)
+        return float(result.value), np.asarray(result.gradient)
 
-    return bfgs(evaluate, x)
+    return bfgs(evaluate, start)
 
 
 def _are_within_limits(excess: Float[np.ndarray, "slots"], multipliers: Float[np.ndarray, "slots"]) -> bool:
-    """Return whether no slot is above its limit, and those with a multiplier are at it; `excess`: power / limit - 1."""
+    """Return whether no slot's power is above its limit, and the power of slots with a multiplier is at it.
+
+    These are the conditions of a constrained minimum, to the search's MARGIN; `excess` is power / limit - 1.
+    """
     return bool(np.all(excess < MARGIN / 2) and np.all(excess[multipliers > 0] > -MARGIN))
 
 
@@ -130,10 +179,11 @@ def _penalise_power(
     has_cost = converges & (total > 0)
     excess = jnp.maximum(0.0, multipliers + STIFFNESS * (power / limit - 1))
     penalty = jnp.sum(excess**2) / (2 * STIFFNESS)
+    # The logarithm is of 1 where there is no cost, so that no gradient becomes NaN.
     return jnp.where(has_cost, jnp.log(jnp.where(has_cost, total, 1.0)) + penalty, jnp.inf)
 
 
-def make_penalised_cost(traces: Callable[[RelaySteps, jax.Array], tuple[jax.Array, jax.Array, jax.Array]]) -> Cost:
+def make_penalised_cost(compute_errors: Callable[[RelaySteps, jax.Array], SteadyErrors]) -> Cost:
     """Return a compiled function that gives a period's gains their cost, its gradient, and the power of each slot.
 
     Relay gains are designed for a small error under power limits, by a descent of this cost. P_s is the error
@@ -142,37 +192,28 @@ def make_penalised_cost(traces: Callable[[RelaySteps, jax.Array], tuple[jax.Arra
     constant c; infinite where the moments do not converge.
 
     Args:
-        traces: `traces(steps, gains)` returns tr P_s of each slot (slots,), whether the moments converge, and the power
-            of each slot (slots,).
+        compute_errors: from the steps of a period and its gains (slots, F n, R) to tr P_s of each slot, whether the
+            moments converge, and the power of each slot.
     """
 
-    def evaluate(
-        x: Array,
-        steps: RelaySteps,
-        base: Array,
-        where: tuple[Array, ...],
-        unit: Array,
-        limit: Array,
-        multipliers: Array,
-    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+    def evaluate(x: Array, gains: FreeGains, limit: Array, multipliers: Array) -> CostOfGains:
         """Return the penalised cost of gains, its gradient by x (n,), and the slots' powers (slots,).
 
         Args:
-            x: changes of the n free entries of the gains (n,), in units of `unit`.
-            steps: steps of a period.
-            base: gains that x changes (slots, F n, R).
-            where: indices of the free entries in them, one array of indices (n,) for each axis.
-            unit: size of each free entry (n,).
+            x: changes of the n free entries of the gains (n,), in units of `gains.unit`.
+            gains: the gains that x changes, and which of their entries.
             limit: greatest power of each slot (slots,).
             multipliers: lambda_s (slots,).
         """
 
         def compute_cost_and_power(x: jax.Array) -> tuple[jax.Array, jax.Array]:
-            """Return the penalised cost of the gains `base` + x in units of `unit`, and beside it the slots' powers."""
-            trace, converges, power = traces(steps, jnp.asarray(base).at[where].add(x * unit))
-            return _penalise_power(trace, converges, power, limit, multipliers), power
+            """Return the penalised cost of the gains changed by x, and beside it the slots' powers."""
+            changed_gains = jnp.asarray(gains.base).at[gains.where].add(x * gains.unit)
+            errors = compute_errors(gains.steps, changed_gains)
+            cost = _penalise_power(errors.traces, errors.converge, errors.power, limit, multipliers)
+            return cost, errors.power
 
         (cost, power), gradient = jax.value_and_grad(compute_cost_and_power, has_aux=True)(x)
-        return cost, gradient, power
+        return CostOfGains(value=cost, gradient=gradient, power=power)
 
     return compile_in_float64(evaluate)

@@ -59,33 +59,38 @@ def receiver_system(network: RelayNetwork, gains: GainsByFilter) -> LinearSystem
     """
     instance("relay network", network, RelayNetwork, "a RelayNetwork")
     gains = table("gains", gains, "arrays (steps, n, received)")
-    # Gains of all relays as one matrix, and the receiver's view of each step: side.transition A, side.output C.
+    # Gains of all relays as one block matrix a step, and with them the system (x, e)+ = A (x, e) + noise, z = C (x, e)
+    # + noise that the receiver observes: A is view.transition (d, d), C is view.output (r, d).
     joined = relay_gains(network, gains)
     steps, n = network.steps(len(joined)), len(network.states)
-    side = _list_receiver_views(steps, initial_error_covariance(network), joined)
-    count, r, d = side.output.shape
+    view = _list_receiver_views(steps, initial_error_covariance(network), joined)
+    count, r, d = view.output.shape
     # Means: x+ has the drift a. z has the constant b: the last r of all numbers that are received in the network.
     _rows, constants = steps.predict_maps()
     drift = np.zeros((count, d + r))
     drift[:, :n], drift[:, d:] = steps.drift, constants[:, -r:]
     # (x, e, z)+ = [A; C] (x, e) + white noise, whatever z was, and z is measured without noise.
-    of_states, of_z = np.concatenate([side.transition, side.output], axis=1), np.zeros((count, d + r, r))
+    of_states = np.concatenate([view.transition, view.output], axis=1)
+    of_z = np.zeros((count, d + r, r))
     system = SystemSteps(
         transition=np.concatenate([of_states, of_z], axis=2),
         drift=drift,
-        process=np.asarray(side.noise),
+        process=np.asarray(view.noise),
         output=np.tile(np.eye(r, d + r, d), (count, 1, 1)),
         offset=np.zeros((count, r)),
         noise=np.zeros((count, r, r)),
     )
+    # At the start x has its mean, errors have the mean 0, and z, which nobody has received yet, is 0.
     mean, covariance = np.zeros(d + r), np.zeros((d + r, d + r))
-    start_mean, _start_covariance = network.initial()
-    mean[:n], covariance[:d, :d] = start_mean, initial_error_covariance(network)[:d, :d]
-    # Gains on what nobody transmits are not used; the receiver comes last.
-    ends, receives = np.cumsum(network.received), np.asarray(steps.receives_in_slot)
-    relayed = {name: np.asarray(gains[name]) * receives[:, None, end - size : end]
-               for name, size, end in zip(network.relays, network.received, ends, strict=False)}  # fmt: skip
-    x_of_state = np.eye(n, d + r)
+    mean[:n], _initial_covariance = network.initial()
+    covariance[:d, :d] = initial_error_covariance(network)[:d, :d]
+    # The relays' gains as used: zero on what nobody transmits in a slot.
+    receives = np.asarray(steps.receives_in_slot)  # (steps, R): 1 for each number that arrives
+    relayed = {}
+    ends = np.cumsum(network.received)
+    for name, size, end in zip(network.relays, network.received, ends, strict=False):  # the receiver, last, is left out
+        relayed[name] = np.asarray(gains[name]) * receives[:, None, end - size : end]
+    x_of_state = np.eye(n, d + r)  # selects x, the first n states
     assumed = AssumedModel(network.plant, relays=network, gains=relayed)
     return with_assumed(LinearSystem(system, mean, covariance, x_of_state), assumed)
 
@@ -105,33 +110,59 @@ class ReceiverViewOfRelays(NamedTuple):
 def make_receiver_view(
     step: RelaySteps, moments: Float[Array, "d d"], gain: Float[Array, "Fn R"]
 ) -> ReceiverViewOfRelays:
-    """Return the linear system of zeta = (x, e_1 ... e_relays), x the state and e_r relay r's error, over one step.
+    """Return the linear system zeta+ = A zeta + noise, z = C zeta + noise that the receiver observes in one step.
+
+    zeta = (x, e_1 .. e_relays) is the plant's state and each relay's error e_r = x - s_r; z is what the receiver
+    receives. With sources = (x, e_1 .. e_F, w, v) and a fixed matrix M,
+      (zeta+ before corrections, i, z) = M sources + (0, what random gains add),  i the relays' innovations,
+    and relay r corrects its error by -K_r i_r: (zeta+, z) = L (zeta+ before corrections, i, z), L as in
+    `_make_relay_correction`.
 
     Args:
         step: the network in this step: x+ = A x + w, the sensor's noise v, moments of the links' random gains.
-        moments: covariance of (x, e_1 ... e_F) of all filters before the step, the receiver last; it decides how much
-            noise random gains add.
-        gain: K of all filters as one block matrix (filters n, R), over all R numbers that they receive.
+        moments: covariance (d, d) of (x, e_1 .. e_F) of all F filters before the step, the receiver's error last; it
+            decides how much noise random gains add.
+        gain: K of all filters as one block matrix (F n, R), over all R numbers that they receive.
+    """
+    maps, d = make_error_step_maps(step), moments.shape[0]
+    zeta_size = d - step.transition.shape[-1]  # without the receiver's error
+    relay_rows = step.gain.shape[0] - step.received[-1]  # numbers that relays receive; those of the receiver follow
+    # M, and L M, whose columns are (x, e_1 .. e_relays), the receiver's error (on which nothing depends), and (w, v).
+    z_of_sources = (step.gain @ maps.sent)[relay_rows:]
+    m_matrix = jnp.concatenate([maps.moved[:zeta_size], maps.innovation[:relay_rows], z_of_sources])
+    l_matrix = _make_relay_correction(step, gain, zeta_size, relay_rows)
+    corrected = l_matrix @ m_matrix
+    # Covariance of the white noise: L Cov(0, random gains' part) L' + (L M)_wv Cov(w, v) (L M)_wv'.
+    _, sent = step_moments(step, moments)
+    added_by_random_gains = contract(step.covariance, sent.second)  # (R, R), of all received numbers
+    of_random_gains = propagate_by_mode(l_matrix[:, zeta_size:], added_by_random_gains, 0.0)
+    noise = jax.scipy.linalg.block_diag(step.process, step.sensor_noise)
+    white = propagate_by_mode(corrected[:, d:], noise, of_random_gains)
+    return ReceiverViewOfRelays(
+        transition=corrected[:zeta_size, :zeta_size], output=corrected[zeta_size:, :zeta_size], noise=white
+    )
+
+
+def _make_relay_correction(
+    step: RelaySteps, gain: Float[Array, "Fn R"], zeta_size: int, relay_rows: int
+) -> Float[jax.Array, "rows columns"]:
+    """Return the matrix L of (zeta+, z) = L (zeta+ before corrections, i, z) for zeta = (x, e_1 .. e_relays).
+
+    i holds the relays' innovations and z what the receiver receives. L = [[I, -(0; K), 0], [0, 0, I]]: the state x is
+    not corrected, and the errors by the relays' gains K, whose columns count only for numbers that arrive in this slot.
+
+    Args:
+        step: the network in this step.
+        gain: gains of all filters as one block matrix (F n, R), the receiver's last.
+        zeta_size: length of zeta.
+        relay_rows: how many numbers the relays receive together.
     """
     n, r = step.transition.shape[-1], step.received[-1]
-    maps, d = make_error_step_maps(step), moments.shape[0]
-    # Sizes of zeta, and of what all relays receive: without the receiver's error and what it receives.
-    zeta, relay_rows = d - n, step.gain.shape[0] - r
-    # (zeta+ before corrections, the relays' innovations, z), as rows over (x, e_1 ... e_F, w, v).
-    received = (step.gain @ maps.sent)[relay_rows:]
-    uncorrected = jnp.concatenate([maps.moved[:zeta], maps.innovation[:relay_rows], received])
-    # The matrix from these to (zeta+, z): e_r+ = e_r+ before its correction - K_r i_r.
-    relay_gain = -(gain * step.receives_in_slot)[: zeta - n, :relay_rows]
-    from_innovations = jnp.concatenate([jnp.zeros((n, relay_rows)), relay_gain])
-    correct_zeta = jnp.concatenate([jnp.eye(zeta), from_innovations, jnp.zeros((zeta, r))], axis=1)
-    correct = jnp.concatenate([correct_zeta, jnp.eye(r, zeta + relay_rows + r, zeta + relay_rows)])
-    corrected = correct @ uncorrected
-    # White noise: of plant and sensor, and what random gains make of the signals sent.
-    noise = jax.scipy.linalg.block_diag(step.process, step.sensor_noise)
-    _, sent = step_moments(step, moments)
-    of_random_gains = propagate_by_mode(correct[:, zeta:], contract(step.covariance, sent.second), 0.0)
-    white = propagate_by_mode(corrected[:, d:], noise, of_random_gains)
-    return ReceiverViewOfRelays(transition=corrected[:zeta, :zeta], output=corrected[zeta:, :zeta], noise=white)
+    relay_gain = -(gain * step.receives_in_slot)[: zeta_size - n, :relay_rows]
+    of_innovations = jnp.concatenate([jnp.zeros((n, relay_rows)), relay_gain])
+    rows_of_zeta = jnp.concatenate([jnp.eye(zeta_size), of_innovations, jnp.zeros((zeta_size, r))], axis=1)
+    rows_of_z = jnp.eye(r, zeta_size + relay_rows + r, zeta_size + relay_rows)
+    return jnp.concatenate([rows_of_zeta, rows_of_z])
 
 
 @compile_in_float64
@@ -145,7 +176,10 @@ def _list_receiver_views(
     """
 
     def move(moments: jax.Array, row: tuple[RelaySteps, jax.Array]) -> tuple[jax.Array, ReceiverViewOfRelays]:
-        """Return the moments of x and all filters' errors after a step, and the system that the receiver observes."""
+        """Return the moments of x and all filters' errors after a step, and the system that the receiver observes.
+
+        `moments` are those before the step; a row has the step and the gains of all filters in it.
+        """
         step, gain = row
         uncorrected, _ = step_moments(step, moments)
         # Corrected by the gains, without those on numbers that no link brings in this slot.

@@ -28,14 +28,17 @@ ENCODER = "encoder"
 def list_differences(believed: AssumedModel, own: AssumedModel) -> tuple[str, ...]:
     """Return the names of the models that differ: those a filter was made for (`believed`), and its node's (`own`).
 
-    Models are plant, sensor, channel and relays. Its claim holds only in the world for which it was made.
+    A filter's claim on its covariance holds only where the models are those for which it was made: so the claim is
+    lowered where the result is not empty. The names are "plant", "sensor", "channel", "trigger" and so on.
     """
-    # `order`: the moments of noises that the filter uses; None for their laws. Past signals may be states of both.
-    order, own = believed.order, _enlarge_world_by_past(believed, own)
+    order = believed.order  # of the moments of noises that the filter uses; None for their whole laws
+    own = _enlarge_world_by_past(believed, own)
     parts = [] if agree_at_each_step(same_plant, believed.plant, own.plant, order) else [PLANT]
     if own.relays is not None or believed.relays is not None:
-        agree = are_same(believed.relays, own.relays) and _same_gains(believed, own)
-        return (*parts, *([] if agree else [RELAYS]))
+        has_same_relays = are_same(believed.relays, own.relays) and _same_gains(believed, own)
+        if not has_same_relays:
+            parts.append(RELAYS)
+        return tuple(parts)
     if believed.sensor is None or believed.channel is None:  # a filter without measurements
         return tuple(parts)
     if own.sensor is None or own.channel is None:
@@ -47,14 +50,14 @@ def list_differences(believed: AssumedModel, own: AssumedModel) -> tuple[str, ..
     if not are_same(believed.encoder, own.encoder):
         parts.append(ENCODER)
     # Sensor and channel agree one by one, or together: what is received of the state through both may be the same.
-    sensors = agree_at_each_step(same_sensor, believed.sensor, own.sensor, order)
-    channels = same_channel(believed.channel, own.channel, order, believed.trigger is None)
-    if sensors and channels:
+    sensors_agree = agree_at_each_step(same_sensor, believed.sensor, own.sensor, order)
+    channels_agree = same_channel(believed.channel, own.channel, order, loses=believed.trigger is None)
+    if sensors_agree and channels_agree:
         return tuple(parts)
     observations = (believed.sensor, believed.channel), (own.sensor, own.channel)
     if agree_at_each_step(same_observation, *observations, order):
         return tuple(parts)
-    parts += [part for part, agree in ((SENSOR, sensors), (CHANNEL, channels)) if not agree]
+    parts += [part for part, agree in ((SENSOR, sensors_agree), (CHANNEL, channels_agree)) if not agree]
     return tuple(parts)
 
 
@@ -73,16 +76,24 @@ def _enlarge_world_by_past(believed: AssumedModel, own: AssumedModel) -> Assumed
 
 
 def join_assumed(assumed_models: Sequence[AssumedModel]) -> AssumedModel:
-    """Return what a filter assumes (its assumed model) that receives the measurements of several filters of one plant.
+    """Return the models that a fusion filter is made for which receives the measurements of several filters of a plant.
 
-    Sensors and channels are stacked. The first trigger, encoder or range of values among them stands for all.
+    Their sensors and channels are stacked. The first trigger, encoder or range of values among them stands for all; a
+    schedule (`Periodic`) is none of these, as silence by schedule says nothing of the state.
+
+    Args:
+        assumed_models: of each filter, the models that it is made for; all have the same plant.
     """
     if len(assumed_models) == 1:
         return assumed_models[0]
     sensors = [assumed.sensor for assumed in assumed_models if assumed.sensor is not None]
     channels = [assumed.channel for assumed in assumed_models if assumed.channel is not None]
     sensor, channel = join_links({str(i): s for i, s in enumerate(sensors)}, channels)
-    triggers = [p.trigger for p in assumed_models if p.trigger is not None and not isinstance(p.trigger, Periodic)]
+    triggers = [
+        assumed.trigger
+        for assumed in assumed_models
+        if assumed.trigger is not None and not isinstance(assumed.trigger, Periodic)
+    ]
     encoders = [assumed.encoder for assumed in assumed_models if assumed.encoder is not None]
     ranges = [assumed.range for assumed in assumed_models if assumed.range is not None]
     return assumed_models[0].replaced(
@@ -96,7 +107,10 @@ def join_assumed(assumed_models: Sequence[AssumedModel]) -> AssumedModel:
 
 
 def restrict_assumed_to_rows(assumed: AssumedModel, rows: Sequence[int]) -> AssumedModel:
-    """Return what a filter assumes (its assumed model) if only these rows of its channel's outputs are received."""
+    """Return the models that a filter is made for if it receives only some of its channel's outputs.
+
+    `rows` are their indices, in the order in which they are received.
+    """
     selection = known(np.eye(first(assumed.channel).outputs)[list(rows)])
     return assumed.replaced(channel=at_each_step(lambda channel: Series([channel, selection]), assumed.channel))
 

@@ -61,23 +61,29 @@ class AssumedModel:
     ):
         """Hold the models for which a filter is made, and on which its claim (exact, upper or nominal) depends.
 
-        `order`: highest order of moments of noises and gains that the filter uses, None for their whole laws. `relays`
-        with their `gains` by name stand for sensor and channel. `range`: limits beyond which the receiver refuses a
-        number. `encoder`: rounds what is sent to codewords.
+        `trigger`: the rule by which the sender sends or is silent. `order`: highest order of moments of noises and
+        gains that the filter uses, None for their whole laws. `relays` with their `gains` by name stand for sensor and
+        channel. `range`: limits beyond which the receiver refuses a number. `encoder`: rounds what is sent to
+        codewords.
         """
-        self.plant, self.sensor, self.channel, self.trigger, self.order = plant, sensor, channel, trigger, order
-        self.relays, self.gains, self.range = relays, {} if gains is None else dict(gains), range
-        self.encoder = encoder
+        self.plant, self.sensor, self.channel = plant, sensor, channel
+        self.trigger, self.order = trigger, order
+        self.relays = relays
+        self.gains = {} if gains is None else dict(gains)
+        self.range, self.encoder = range, encoder
 
     def replaced(self, **parts: Any) -> "AssumedModel":
-        """Return the models that a filter was made for with some of them replaced, such as plant=..."""
+        """Return a copy of these models in which some are replaced, by the names of their attributes (plant=...)."""
         other = copy(self)
         other.__dict__.update(parts)
         return other
 
 
 class StaticAssumedModel:
-    """An assumed model as a static field of a tree of arrays: all are equal, so that none decides what is compiled.
+    """An assumed model as a static field of a filter, which is a tree of arrays.
+
+    JAX compiles a program anew for another static field. All objects of this class count as equal, so that filters
+    which differ in their assumed model alone share one program.
 
     lowered: whether the claim was lowered, since the filter runs in another world than its assumed model.
     """
@@ -87,11 +93,11 @@ class StaticAssumedModel:
         self.assumed, self.lowered = assumed, lowered
 
     def __eq__(self, other: object) -> bool:
-        """Return True for any other assumed model."""
+        """Return True for any other object of this class, so that no assumed model decides what is compiled."""
         return isinstance(other, StaticAssumedModel)
 
     def __hash__(self) -> int:
-        """Return the hash that all assumed models have."""
+        """Return the same hash for all assumed models, since they count as equal."""
         return hash(StaticAssumedModel)
 
 
@@ -103,7 +109,7 @@ class HasAssumedModel(Protocol):
 
     @property
     def kept(self) -> StaticAssumedModel:
-        """The assumed model as it is kept."""
+        """The models for which it was made, wrapped so that they do not decide what is compiled."""
 
 
 B = TypeVar("B", bound=HasAssumedModel)

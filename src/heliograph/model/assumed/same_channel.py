@@ -23,7 +23,9 @@ from heliograph.random_affine.series_and_stack import Series
 
 
 def same_channel(a: Channel, b: Channel, order: int | None, loses: bool) -> bool:
-    """Return whether two channels agree; memories at the same place count as the same.
+    """Return whether a filter that was made for the channel a is right for the channel b too.
+
+    Names of memories (such as fadings) are not compared: memories at the same place count as the same.
 
     Args:
         a: a channel, constant or over time.
@@ -71,7 +73,11 @@ def _same_map(a: AbstractRandomAffine, b: AbstractRandomAffine, order: int | Non
 
 
 def _same_given_arrival(a: AbstractRandomAffine, b: AbstractRandomAffine) -> bool:
-    """Return whether two maps are the same except for what they lose; False if losses depend on gains."""
+    """Return whether two maps are the same map of what arrives, though they may lose messages in other ways.
+
+    A filter sees what is lost, so it need not know the law of losses. False where losses depend on the gains, since a
+    loss then tells of the gain.
+    """
     try:
         return are_same(a.condition_on_arrival(), b.condition_on_arrival())
     except ValueError:  # losses depend on gains
@@ -126,22 +132,25 @@ def _moments_agree(a: Moments, b: Moments, arrived: np.ndarray) -> bool:
     """Return whether the moments of the components that arrived are equal to rounding (EQUAL), relative to their size.
 
     a and b are each E[(G, n)] (m, p + 1), and E[z z' | y] as a tensor (m, m, p + 1, p + 1) acting on (y, 1) (y, 1)'.
+    The size of an entry H_ia of H = (G, n) is E[H_ia^2]^(1/2), the larger of those of a and b.
     """
     (mean_a, second_a), (mean_b, second_b) = a, b
     rows = np.ix_(arrived, arrived)
-    powers = [np.abs(np.einsum("iiaa->ia", second))[arrived] for second in (second_a, second_b)]
-    size = np.sqrt(np.maximum(*powers))
-    scale = size[:, None, :, None] * size[None, :, None, :]
+    squares = [np.abs(np.einsum("iiaa->ia", second))[arrived] for second in (second_a, second_b)]  # E[H_ia^2]
+    size = np.sqrt(np.maximum(*squares))
+    size_of_product = size[:, None, :, None] * size[None, :, None, :]  # of H_ia H_jb, at [i, j, a, b]
     means_agree = np.all(np.abs(mean_a - mean_b)[arrived] <= EQUAL * size)
-    return bool(means_agree and np.all(np.abs(second_a[rows] - second_b[rows]) <= EQUAL * scale))
+    seconds_agree = np.all(np.abs(second_a[rows] - second_b[rows]) <= EQUAL * size_of_product)
+    return bool(means_agree and seconds_agree)
 
 
 def same_observation(
     a: tuple[AbstractSensor, AbstractRandomAffine], b: tuple[AbstractSensor, AbstractRandomAffine], order: int | None
 ) -> bool:
-    """Return whether two pairs of sensor and channel are one map from the state, though written differently.
+    """Return whether two pairs (sensor, channel), a and b, are one map from the state, though written differently.
 
-    This is only decided for filters that use mean and covariance (`order`).
+    An example is a factor that stands in the sensor's matrix or in the channel's gain. Moments of the maps are
+    compared, so that this is only decided for filters that use mean and covariance (`order`); else it is False.
     """
     if order != MEAN_AND_COVARIANCE or is_traced(a, b):
         return False
@@ -152,7 +161,10 @@ def same_observation(
 
 
 def _compose_with_sensor(sensor: AbstractSensor, channel: AbstractRandomAffine) -> AbstractRandomAffine | None:
-    """Return the map from the state to what is received; None unless the sensor is linear, without angles, delays."""
+    """Return the map from the state to what is received: the sensor's y = C x + v, then the channel's z = G y + n.
+
+    None where it is no such map: for a sensor that is not linear or has angles, or a channel that is late.
+    """
     matrix = find_sensor_matrix(sensor)
     if matrix is None or sensor.angles or channel.past:
         return None

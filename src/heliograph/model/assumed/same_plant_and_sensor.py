@@ -20,17 +20,31 @@ from heliograph.random_affine.noises.outlier_noise import has_bounded_noise
 
 
 def agree_at_each_step(agree: Callable[..., bool], a: object, b: object, order: int | None) -> bool:
-    """Return whether agree(a, b, order) at each step; `order` of the moments that a filter uses, None for the law."""
+    """Return whether two models agree at each step: whether agree(a_k, b_k, order) is true for all k.
+
+    Args:
+        agree: compares two models of one step, as `same_plant` does.
+        a: a model, constant or over time.
+        b: the other. Where both vary, they must cover the same number of steps.
+        order: order of the moments of noises that a filter uses, None for their whole laws.
+    """
     if are_same(a, b):
         return True
     if steps_covered((a, b)) is None:
         return agree(a, b, order)
     covered = {steps for steps in (steps_covered(a), steps_covered(b)) if steps is not None}
-    return len(covered) == 1 and all(agree(at(a, k), at(b, k), order) for k in range(covered.pop()))
+    if len(covered) != 1:
+        return False
+    (horizon,) = covered
+    return all(agree(at(a, k), at(b, k), order) for k in range(horizon))
 
 
 def same_noise(a: AbstractNoise, b: AbstractNoise, order: int | None) -> bool:
-    """Return whether noises agree in what a filter uses of them: mean and covariance (`order`), or the whole law."""
+    """Return whether two noises agree in what a filter uses of them.
+
+    `order` is MEAN_AND_COVARIANCE for a filter that uses these alone, and None for one that uses the whole law: then
+    only the same law agrees. A noise that is known by a bound of its covariance agrees with such noises only.
+    """
     if are_same(a, b):
         return True
     if order != MEAN_AND_COVARIANCE or has_bounded_noise(a) != has_bounded_noise(b):
@@ -39,11 +53,15 @@ def same_noise(a: AbstractNoise, b: AbstractNoise, order: int | None) -> bool:
 
 
 def same_plant(a: AbstractPlant, b: AbstractPlant, order: int | None) -> bool:
-    """Tell whether two plants agree in law, or in mean and covariance where the filter uses no more."""
+    """Return whether two plants agree in law, or in mean and covariance if a filter uses no more of their noises.
+
+    Compared are the numbers of states and inputs, which states are angles or attitudes, the law of x_0, the motion, and
+    the noise. `order` is the order of the moments that the filter uses, None for the whole law.
+    """
     if are_same(a, b):
         return True
     if any(isinstance(plant.initial_covariance, UnknownStart) or isinstance(plant, ModalPlant) for plant in (a, b)):
-        return False  # of these, only the same is the same
+        return False  # such plants are compared as a whole only, above
     sizes = [(len(plant.states), len(plant.inputs), plant.manifold) for plant in (a, b)]
     if sizes[0] != sizes[1] or not equal_to_rounding(a.initial_mean, b.initial_mean):
         return False
@@ -57,7 +75,10 @@ def same_plant(a: AbstractPlant, b: AbstractPlant, order: int | None) -> bool:
 
 
 def _same_motion(a: AbstractPlant, b: AbstractPlant) -> bool:
-    """Return whether two plants move a state alike: by equal matrices, or by the same function of state and inputs."""
+    """Return whether two plants have the same transition: equal matrices A and B, or the same function f(x, u).
+
+    Matrices that depend on inputs, and functions, are compared as programs that JAX traces.
+    """
     if isinstance(a, LinearPlant) and isinstance(b, LinearPlant):
         matrices = (a.matrix, a.input_matrix, b.matrix, b.input_matrix)
         if not any(isinstance(matrix, MatrixOfInputs) for matrix in matrices):
@@ -77,7 +98,10 @@ def _same_disturbance(a: AbstractPlant, b: AbstractPlant, order: int | None) -> 
 
 
 def same_sensor(a: AbstractSensor, b: AbstractSensor, order: int | None) -> bool:
-    """Tell whether two sensors measure the same, and with noise of the same moments up to `order`."""
+    """Return whether two sensors measure the same function of the state, with noises that agree.
+
+    `order` is the order of the moments of the noise that a filter uses, None for its whole law.
+    """
     if are_same(a, b):
         return True
     if isinstance(a, ModalSensor) or isinstance(b, ModalSensor):
@@ -96,21 +120,22 @@ def same_sensor(a: AbstractSensor, b: AbstractSensor, order: int | None) -> bool
 
 
 def _same_sensor_of_inputs(a: AbstractSensor, b: AbstractSensor, order: int | None) -> bool:
-    """Return whether two sensors that depend on inputs are the same programs of state and inputs, with like noise.
+    """Return whether two sensors that depend on inputs u are the same functions h(x, u), with noises that agree.
 
-    `order`: of the moments of noise that a filter uses, None for its whole law.
+    Functions are the same if JAX traces them to the same program. `order`: order of the moments of the noise that a
+    filter uses, None for its whole law.
     """
     if a.inputs != b.inputs or a.angles != b.angles or len(a.outputs) != len(b.outputs):
         return False
-    u = (len(a.inputs),)
+    shape_of_u = (len(a.inputs),)
     if isinstance(a.noise, AbstractNoise) and isinstance(b.noise, AbstractNoise):
         if not same_noise(a.noise, b.noise, order):
             return False
-    elif not same_function(_noise_as_function_of_inputs(a), _noise_as_function_of_inputs(b), u):
+    elif not same_function(_noise_as_function_of_inputs(a), _noise_as_function_of_inputs(b), shape_of_u):
         return False
     # Sensors do not know how many states they measure: any number that both take will do.
     return any(
-        same_function(_measure_as_function_of_inputs(a), _measure_as_function_of_inputs(b), (n,), u)
+        same_function(_measure_as_function_of_inputs(a), _measure_as_function_of_inputs(b), (n,), shape_of_u)
         for n in _find_common_state_length(a, b)
     )
 
@@ -148,5 +173,6 @@ def find_sensor_matrix(sensor: AbstractSensor) -> np.ndarray | None:
         return None if sensor.inputs or is_traced(sensor.matrix) else np.asarray(sensor.matrix)
     if not isinstance(sensor, JointSensor):
         return None
-    matrices = [matrix for part in sensor.parts if (matrix := find_sensor_matrix(part)) is not None]
-    return np.concatenate(matrices) if len(matrices) == len(sensor.parts) else None
+    matrices = [find_sensor_matrix(part) for part in sensor.parts]
+    known_matrices = [matrix for matrix in matrices if matrix is not None]
+    return np.concatenate(known_matrices) if len(known_matrices) == len(matrices) else None

@@ -47,7 +47,8 @@ def _same_parameter(a: Any, b: Any) -> bool:
 def _same_program(a: core.Jaxpr, b: core.Jaxpr) -> bool:
     """Return whether two programs (jaxprs) do the same operations in the same order, whatever variables are called.
 
-    Variables get numbers in the order in which they appear. ASIDE: parameters that change no result, such as labels.
+    A program is a list of operations (`eqns`) with inputs, outputs and parameters. Variables get numbers in the order
+    in which they appear, by which they are compared. ASIDE: parameters that change no result, such as labels.
     """
     if len(a.eqns) != len(b.eqns):
         return False
@@ -65,7 +66,11 @@ def _same_program(a: core.Jaxpr, b: core.Jaxpr) -> bool:
 
 
 def _number_variables(names: tuple[dict[Any, int], dict[Any, int]], a: Sequence[Any], b: Sequence[Any]) -> None:
-    """Give the variables of both programs, a and b, their next numbers, in place."""
+    """Number the variables a of one program and b of the other in the order given, after those numbered before.
+
+    `names` has for each program the number of each variable, and is changed in place. Variables of two programs that
+    have the same number play the same part.
+    """
     for known, variables in zip(names, (a, b), strict=True):
         known.update({variable: len(known) + i for i, variable in enumerate(variables)})
 
@@ -81,7 +86,9 @@ def _same_atoms(names: tuple[dict[Any, int], dict[Any, int]], a: Sequence[Any], 
 
 
 def _same_atom(names: tuple[dict[Any, int], dict[Any, int]], x: Any, y: Any) -> bool:
-    """Return whether operands are equal constants, or variables with the same number and type.
+    """Return whether the operand x of one program and y of another are equal constants, or the same variable.
+
+    Variables are the same if they have the same number and type.
 
     `names`: for each program, the number of each variable in order of appearance.
     """
@@ -89,4 +96,6 @@ def _same_atom(names: tuple[dict[Any, int], dict[Any, int]], x: Any, y: Any) -> 
         return are_same(np.asarray(x.val), np.asarray(y.val))
     if isinstance(x, core.Literal) or isinstance(y, core.Literal):
         return False
-    return names[0][x] == names[1][y] and x.aval == y.aval
+    numbers_in_a, numbers_in_b = names
+    has_same_type = x.aval == y.aval
+    return numbers_in_a[x] == numbers_in_b[y] and has_same_type

@@ -98,10 +98,10 @@ def _make_gauss_markov(
     deviations = [scalar(what, x, 0.0) for x in _broadcast_to_biases(what, deviation, count)]
     # 1 / T of each.
     rates = [_invert_time_constant(x) for x in _broadcast_to_biases("time of a bias", time, count)]
-    # Deviation and 1 / T of each bias, as arrays (biases,).
+    # Deviation and 1 / T of each bias, as arrays (biases,), JAX's where a number is traced.
     sd, rate = (library(values).stack([library(x).asarray(x) for x in values]) for values in (deviations, rates))
     xp = library(sd, rate)
-    start, center = xp.diag(sd**2), np.zeros(count)
+    start, center = xp.diag(sd**2), np.zeros(count)  # covariance and mean of b_0
     # A step that is a number makes constants; else the matrices are functions of the input that says it.
     if not isinstance(dt, str):
         step = scalar("time of a step", dt, 0.0)
@@ -192,15 +192,21 @@ def append_driving_plant(plant: AbstractPlant, bias: LinearPlant, coupling: np.n
 
 
 def _make_driven_matrices(plant: LinearPlant, bias: LinearPlant, E: np.ndarray, inputs_of_bias: Any) -> tuple[Any, Any]:
-    """Return [[A, E], [0, F]] and [B; B_b], as functions of the inputs u where some block is a function of them.
+    """Return the transition matrix [[A, E], [0, F]] and the input matrix [B; B_b] of the joint state (x, b).
 
-    They are transition and input matrix of (x, b): the plant x+ = A x + E b + B u, driven by biases b+ = F b + B_b u_b,
-    with E the coupling and u_b = `inputs_of_bias` @ u the inputs that move the biases. If some block is a function of
-    the inputs u, so are the results.
+    The plant x+ = A x + E b + B u is driven by biases b+ = F b + B_b u_b. If a matrix of the plant or of the biases is
+    a function of the inputs u (`MatrixOfInputs`), as of the length of a step, both results are functions of u; else
+    both are arrays.
+
+    Args:
+        plant: the plant of x, with A and B.
+        bias: the plant of b, with F and B_b.
+        E: the coupling (n, biases).
+        inputs_of_bias: the matrix of zeros and ones with u_b = `inputs_of_bias` @ u.
     """
-    # All blocks are numbers: two matrices.
     zeros = np.zeros((len(bias.states), len(plant.states)))
-    if not any(isinstance(value, MatrixOfInputs) for model in (plant, bias) for value in vars(model).values()):
+    depends_on_inputs = any(isinstance(v, MatrixOfInputs) for model in (plant, bias) for v in vars(model).values())
+    if not depends_on_inputs:
         xp = library(plant.matrix, E, bias.matrix, plant.input_matrix, bias.input_matrix)
         matrix = xp.block([[plant.matrix, E], [zeros, bias.matrix]])
         return matrix, xp.concatenate([plant.input_matrix, bias.input_matrix @ inputs_of_bias])
@@ -223,7 +229,7 @@ def _make_driven_matrices(plant: LinearPlant, bias: LinearPlant, E: np.ndarray, 
 
 
 class BiasedMeasurement(Module):
-    """Measurement h(x) + D b of the state [x; b], of which the first `states` are x."""
+    """Measurement h(x) + D b of the state [x; b], of which the first `states` are x; h of `sensor`, D = `loading`."""
 
     sensor: AbstractSensor
     loading: Array
@@ -241,8 +247,9 @@ def _add_bias_to_sensor(sensor: AbstractSensor, loading: np.ndarray, states: int
     """
     if not isinstance(sensor, LinearSensor):
         return Sensor(BiasedMeasurement(sensor, loading, states), sensor.noise, sensor.outputs, sensor.circular)
-    stacked = library(sensor.matrix, loading).concatenate([sensor.matrix, loading], axis=1)
-    return LinearSensor(stacked, sensor.noise, sensor.outputs, sensor.circular)
+    xp = library(sensor.matrix, loading)  # NumPy, or JAX's for traced numbers
+    C_and_D = xp.concatenate([sensor.matrix, loading], axis=1)  # [C, D] of the state [x; b]
+    return LinearSensor(C_and_D, sensor.noise, sensor.outputs, sensor.circular)
 
 
 def _broadcast_to_biases(name: str, value: ArrayLike, count: int) -> list[Any]:
@@ -255,6 +262,10 @@ def _broadcast_to_biases(name: str, value: ArrayLike, count: int) -> list[Any]:
 
 
 def _invert_time_constant(time: Any) -> Any:
-    """Return 1 / T, 0 of an infinite one."""
-    constant = not is_traced(time) and isinstance(time, float | np.floating) and time == np.inf
-    return 0.0 if constant else 1 / scalar("time of a bias", time, TINY)
+    """Return the rate 1 / T at which a bias is forgotten, 0 for an infinite T: a constant bias.
+
+    Raises:
+        ValueError: a time that is not positive.
+    """
+    is_infinite = not is_traced(time) and isinstance(time, float | np.floating) and time == np.inf
+    return 0.0 if is_infinite else 1 / scalar("time of a bias", time, TINY)

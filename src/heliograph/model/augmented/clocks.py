@@ -108,7 +108,11 @@ def with_clocks(
 
 
 def _read_step_length(plant: AbstractPlant, dt: ArrayLike | str) -> Any:
-    """Return the checked time of a step, which is not negative, or the name of the plant's input that holds it."""
+    """Return the length of a step: a number, or the name of the plant's input that says it.
+
+    Raises:
+        ValueError: a negative number, or a name that is no input of the plant.
+    """
     if not isinstance(dt, str):
         return scalar("time of a step", dt, 0.0)
     if dt not in plant.inputs:
@@ -140,13 +144,16 @@ def _make_clock_plant(clocks: Mapping[str, Clock], dt: str | Any) -> LinearPlant
         wanders.append(wander_of_clock)
         offset = f"{name}_offset"  # in the unit of dt, where that is an input with one
         states += [rename(dt, offset) if isinstance(dt, str) else offset, f"{name}_drift"]
+    # As arrays, JAX's where a number is traced.
     mean, variance, wander = (library(x).asarray(library(x).stack(x)) for x in (means, variances, wanders))
-    one_each, xp = np.eye(len(clocks)), library(variance, wander)
+    xp = library(variance, wander)
     start, strength = xp.diag(variance), xp.diag(wander)
-    # Steps of one length.
+    one_each = np.eye(len(clocks))  # kron(one_each, F) has a block F for each clock
+    # Steps of one length: F = [[1, dt], [0, 1]] of each clock, and its drift alone gains noise.
     if not isinstance(dt, str):
+        matrix = np.kron(one_each, [[1.0, dt], [0.0, 1.0]])
         noise = xp.kron(strength, np.diag([0.0, 1.0]))
-        return LinearPlant(np.kron(one_each, [[1.0, dt], [0.0, 1.0]]), noise, mean, start, states=states)
+        return LinearPlant(matrix, noise, mean, start, states=states)
 
     # Steps of a length that an input says: the integral of white noise in the drift, and of that in the offset.
     def matrix_over(u: jax.Array) -> jax.Array:
@@ -154,7 +161,10 @@ def _make_clock_plant(clocks: Mapping[str, Clock], dt: str | Any) -> LinearPlant
         return jnp.kron(one_each, jnp.array([[1.0, u[0]], [0.0, 1.0]]))
 
     def noise_over(u: jax.Array) -> jax.Array:
-        """Return the noise's covariance over a step of length u[0]."""
+        """Return the covariance of (offset, drift) of all clocks gained over a step of length u[0].
+
+        The drift gains white noise, and the offset its integral: wander [[dt^3 / 3, dt^2 / 2], [dt^2 / 2, dt]] each.
+        """
         of_clock = jnp.array([[u[0] ** 3 / 3, u[0] ** 2 / 2], [u[0] ** 2 / 2, u[0]]])
         return jnp.kron(jnp.asarray(strength), of_clock)
 
@@ -164,9 +174,14 @@ def _make_clock_plant(clocks: Mapping[str, Clock], dt: str | Any) -> LinearPlant
 def _make_stamped_sensor(
     sensor: AbstractSensor, motion: Motion, states: int, total: int, offset: int | None
 ) -> LinearSensor | StampedSensor:
-    """Return the sensor for a state of `total` components, of which the first `states` are those that it measures.
+    """Return a node's sensor for the larger state: the plant's states, then offset and drift of each clock.
 
-    `offset`: the place of its clock's offset; None of a sensor whose clock is right.
+    Args:
+        sensor: the node's sensor of the plant's states.
+        motion: dx/dt of the plant's states, a function or a matrix; by it a wrong time stamp becomes an error of y.
+        states: number of the plant's states, which stand first.
+        total: number of all states.
+        offset: index of the offset of this node's clock; None for a node whose clock is right, which needs no motion.
     """
     if offset is None and isinstance(sensor, LinearSensor):
         matrix = library(sensor.matrix).pad(sensor.matrix, ((0, 0), (0, total - states)))
@@ -176,7 +191,7 @@ def _make_stamped_sensor(
         noise=sensor.noise,
         motion=motion if offset is not None else None,
         states=states,
-        offset=offset or 0,
+        offset=offset or 0,  # not used where the clock is right
         outputs=sensor.outputs,
         circular=sensor.circular,
     )

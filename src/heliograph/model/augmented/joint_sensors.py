@@ -20,7 +20,7 @@ from heliograph.random_affine.noises.noise import AbstractNoise, Gaussian, Indep
 
 
 class JointSensor(AbstractSensor):
-    """Sensors of one state, their outputs one above the other, their noises independent."""
+    """Several sensors of one state as one: their outputs follow one another, and their noises are independent."""
 
     parts: tuple[AbstractSensor, ...]
     noise: AbstractNoise
@@ -85,45 +85,53 @@ class InputDependentSensors(Module):
 
 
 class JointMatrix(InputDependentSensors):
-    """Matrices of linear sensors, one above the other."""
+    """Matrix of linear sensors as one, their rows one above the other, as a function of the inputs."""
 
     def __call__(self, u: jax.Array) -> jax.Array:
-        """Return C (m, n)."""
+        """Return C (m, n) under the inputs u of all sensors."""
         return jnp.concatenate([jnp.asarray(sensor.matrix) for sensor in self.given(u)])
 
 
 class JointMeasure(InputDependentSensors):
-    """Measurements of sensors, one above the other."""
+    """Function h(x, u) of several sensors as one: their measurements follow one another."""
 
     def __call__(self, x: jax.Array, u: jax.Array) -> jax.Array:
-        """Return h(x, u)."""
+        """Return the measurements h(x, u) (m,) of all sensors, of the state x under the inputs u."""
         return jnp.concatenate([sensor.measure(x) for sensor in self.given(u)])
 
 
 class JointSensorNoise(InputDependentSensors):
-    """Covariance of independent noises of sensors."""
+    """Covariance of the independent noises of several sensors, block-diagonal, as a function of the inputs."""
 
     def __call__(self, u: jax.Array) -> jax.Array:
-        """Return the covariance (m, m)."""
+        """Return the covariance (m, m) under the inputs u of all sensors."""
         return jnp.asarray(block_diagonal([jnp.asarray(sensor.noise.covariance) for sensor in self.given(u)]))
 
 
 def _join_sensors_of_inputs(
     parts: tuple[AbstractSensor, ...], outputs: Sequence[str], circular: Sequence[str]
 ) -> LinearSensor | Sensor:
-    """Return sensors of which some depend on inputs as one that depends on all of these."""
+    """Return several sensors, of which some depend on inputs, as one that depends on all of these inputs.
+
+    Args:
+        parts: the sensors.
+        outputs: names of all outputs.
+        circular: names of those that are angles.
+
+    Raises:
+        ValueError: a noise that depends on inputs beside one that is not Gaussian.
+    """
     inputs = list(dict.fromkeys(name for sensor in parts for name in sensor.inputs))
-    every = parts, tuple(tuple(inputs.index(name) for name in sensor.inputs) for sensor in parts)
+    indices = tuple(tuple(inputs.index(name) for name in sensor.inputs) for sensor in parts)  # of each one's inputs
     noises = [sensor.noise for sensor in parts]
-    noise: Any = JointSensorNoise(*every)
-    if all(isinstance(law, AbstractNoise) for law in noises):
+    noise: Any = JointSensorNoise(parts, indices)
+    if all(isinstance(law, AbstractNoise) for law in noises):  # laws that do not depend on inputs
         noise = Independent(noises)
     elif not all(isinstance(law, Gaussian | NoiseOfInputs) for law in noises):
         raise fail("noises of joined sensors", "Gaussian ones beside one that depends on inputs", "another law")
-    linear = all(isinstance(sensor, LinearSensor) for sensor in parts)
-    if linear:
-        return LinearSensor(JointMatrix(*every), noise, outputs, circular, inputs=inputs)
-    return Sensor(JointMeasure(*every), noise, outputs, circular, inputs=inputs)
+    if all(isinstance(sensor, LinearSensor) for sensor in parts):
+        return LinearSensor(JointMatrix(parts, indices), noise, outputs, circular, inputs=inputs)
+    return Sensor(JointMeasure(parts, indices), noise, outputs, circular, inputs=inputs)
 
 
 def join_links(sensors: Mapping[str, AnySensor], channels: Sequence[Channel]) -> tuple[AnySensor, Channel]:

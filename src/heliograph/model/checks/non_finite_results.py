@@ -45,7 +45,10 @@ def describe_non_finite_function(filter: PyTree, before: Estimate, u: Float[np.n
 
 
 def _yield_trial_states(before: Estimate) -> Iterator[Float[np.ndarray, " n"]]:
-    """Yield states at which to try a model's functions: the mean, and one deviation from it to each side by state."""
+    """Yield states at which to try a model's functions: the mean, and one standard deviation from it to each side.
+
+    One state is moved at a time; those without a finite, positive variance stay at the mean.
+    """
     mean = np.asarray(before.mean)
     variances = np.diag(np.asarray(before.covariance))
     yield mean
@@ -55,12 +58,12 @@ def _yield_trial_states(before: Estimate) -> Iterator[Float[np.ndarray, " n"]]:
 
 
 def _plant_fits(plant: AbstractPlant, x: np.ndarray, u: np.ndarray) -> bool:
-    """Return whether a plant has as many states and inputs."""
+    """Return whether a plant has as many states as x and as many inputs as u."""
     return len(plant.states) == len(x) and len(plant.inputs) == len(u)
 
 
 def _measure(sensor: AbstractSensor, x: np.ndarray) -> np.ndarray:
-    """Return h(x), or an empty array if the sensor cannot take a state of this length."""
+    """Return what the sensor measures of a state x, h(x), or an empty array if it takes states of another length."""
     try:
         return np.asarray(sensor.measure(jnp.asarray(x)))
     except (TypeError, ValueError, IndexError):

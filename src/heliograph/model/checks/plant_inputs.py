@@ -31,7 +31,7 @@ ModelMatrixFunction = Callable[[Any, jax.Array], jax.Array]  # of a plant or a s
 
 
 class TimeStepFault(NamedTuple):
-    """A row whose time step is none: its number from 0, what was expected, and what came."""
+    """A row whose time step is not valid: its number from 0, what was expected and what came, for an error."""
 
     row: int
     expected: str
@@ -39,24 +39,26 @@ class TimeStepFault(NamedTuple):
 
 
 def find_time_step_fault(dt: Float[np.ndarray, " steps"]) -> TimeStepFault | None:
-    """Return the first time step that cannot be one, or None: it goes backwards, is beyond 2^53, or a counter wrapped.
+    """Return the first of some time steps that is not valid, with the words of an error; None if all are.
 
-    LONGEST: 2^53. WRAPPED: 2^32, near which a negative difference of unsigned counters of 32 bits lies. SMALLER: counts
-    in a unit of dt, of counters in milliseconds and microseconds.
+    A step may go backwards, be beyond LONGEST (2^53), or come from a clock that went back by d counts: a clock of
+    unsigned 32-bit counts then gives 2^32 - d (WRAPPED is 2^32).
     """
-    bad = ~np.asarray(_is_time_step(dt))
-    if not bad.any():
+    is_invalid = ~np.asarray(_is_time_step(dt))
+    if not is_invalid.any():
         return None
-    row = int(np.argmax(bad))
+    row = int(np.argmax(is_invalid))
     got = f"{dt[row]:.10g}"
     if dt[row] < 0:
         return TimeStepFault(row, "a time step that does not go backwards", got)
     if dt[row] > LONGEST:
         return TimeStepFault(row, "a time step of at most 2^53 units, as far as a double counts", got)
-    # In counts of the unit that it is nearest to 2^32 in.
-    counts = min((1.0, *SMALLER), key=lambda counts: abs(dt[row] * counts - WRAPPED))
-    below = f"{round(dt[row] * counts - WRAPPED)}" + (f" / {counts:g}" if counts > 1 else "")
-    return TimeStepFault(row, "a time step", f"{got}: {below} as a difference of unsigned counters of 32 bits")
+    # A wrapped counter. It counts in the unit of dt, or in thousandths or millionths of it (SMALLER: counts in a unit):
+    # the one in which the step is nearest to 2^32. The step that was meant is negative, the difference to 2^32.
+    counts_in_unit = min((1.0, *SMALLER), key=lambda counts: abs(dt[row] * counts - WRAPPED))
+    counts_meant = round(dt[row] * counts_in_unit - WRAPPED)
+    step_meant = f"{counts_meant}" + (f" / {counts_in_unit:g}" if counts_in_unit > 1 else "")
+    return TimeStepFault(row, "a time step", f"{got}: {step_meant} as a difference of unsigned counters of 32 bits")
 
 
 def check_time_step(names: Sequence[str], u: Float[np.ndarray, "... inputs"]) -> None:
@@ -77,8 +79,9 @@ def check_time_step(names: Sequence[str], u: Float[np.ndarray, "... inputs"]) ->
 def _is_time_step(dt: Array, precision: type = np.float64) -> Array:
     """Return whether each number can be a time step: from 0 to LONGEST (2^53), and not from a counter that wrapped.
 
-    A negative difference of unsigned 32-bit counters reads as just below 2^32. That means within NEAR for whole
-    numbers, or within CLOSE if dt has SMALLER = 1e3 or 1e6 counts in a unit. `precision`: type of the numbers.
+    A clock that counts in unsigned numbers of 32 bits and goes back by d gives the difference 2^32 - d. So numbers just
+    below 2^32 are refused: whole ones, counts themselves, within NEAR of it; those that are thousandths or millionths
+    of a unit (SMALLER: counts in a unit), within CLOSE counts. `precision`: type of the numbers.
     """
     has_wrapped = _is_near_wrap(dt, 1.0, NEAR, precision) & (dt.round() == dt)
     for counts_in_unit in SMALLER:
@@ -133,21 +136,28 @@ def check_inputs(
 
 
 def _sensors_of_inputs(models: PyTree, names: Sequence[str]) -> Iterator[tuple[AnySensor, list[int]]]:
-    """Yield the sensors in `models` that depend on inputs, all of which are in `names`, with their indices there."""
+    """Yield the sensors in `models` that depend on inputs, each with the indices of its inputs among `names`.
+
+    So a row of all inputs gives those of a sensor. Sensors of other inputs are left out. A sensor may vary over time;
+    the names of its inputs are those of its first step.
+    """
     for sensor in yield_models_of_class(models, AbstractSensor):
-        own = first(sensor).inputs
-        if own and set(own) <= set(names):
-            yield sensor, [list(names).index(name) for name in own]
+        own_inputs = first(sensor).inputs
+        if own_inputs and set(own_inputs) <= set(names):
+            yield sensor, [list(names).index(name) for name in own_inputs]
 
 
 def yield_plants(models: PyTree) -> Iterator[AnyPlant]:
-    """Yield the plants that a model object holds; of one with modes its laws of motion."""
+    """Yield the plants that a model object holds; of a plant with modes the plant of each mode."""
     for plant in yield_models_of_class(models, AbstractPlant):
         yield from list_mode_models(plant)
 
 
 def yield_models_of_class(models: PyTree, kind: type) -> Iterator[PyTree]:
-    """Yield all models of a class, such as sensors, within a model object, whether constant or varying over time."""
+    """Yield all models of the class `kind`, such as sensors, that a model object (a filter, say) holds anywhere.
+
+    A model that varies over time is yielded as the `OverTime` that it is.
+    """
 
     def is_part(part: object) -> bool:
         """Return whether an object is of the class, constant or over time."""
@@ -157,7 +167,10 @@ def yield_models_of_class(models: PyTree, kind: type) -> Iterator[PyTree]:
 
 
 def _list_functions_of_inputs(model: AbstractPlant | AbstractSensor) -> dict[str, ModelMatrixFunction]:
-    """Return the functions of the inputs alone, by name: matrices, and the covariance of the noise."""
+    """Return, by name for errors, the functions that give a model's matrices and noise covariance from its inputs.
+
+    Matrices and covariances that are constants are left out: they were checked when the model was made.
+    """
     every: dict[str, ModelMatrixFunction] = {}
     if isinstance(model, AbstractSensor):
         if isinstance(model, LinearSensor) and isinstance(model.matrix, MatrixOfInputs):
@@ -185,13 +198,13 @@ def _sensor_matrix(sensor: LinearSensor, u: jax.Array) -> jax.Array:
 
 
 def _sensor_noise(sensor: AbstractSensor, u: jax.Array) -> jax.Array:
-    """Return the noise's covariance of a sensor of inputs, under its inputs u."""
+    """Return the covariance R(u) of the noise of a sensor whose noise is a function of its inputs u."""
     assert isinstance(sensor.noise, NoiseOfInputs)
     return sensor.noise.given(u)
 
 
 def _input_matrix(plant: AbstractPlant, u: jax.Array) -> jax.Array:
-    """Return B of a linear plant under the inputs u."""
+    """Return the input matrix B(u) of a linear plant."""
     assert isinstance(plant, LinearPlant)
     return matrix_under_inputs(plant.input_matrix, u)
 
@@ -204,13 +217,16 @@ def _check_functions_of_inputs(
     COVARIANCES: names of the matrices that must be covariances. `steps`: the step of each row.
     """
     functions = _list_functions_of_inputs(first(plant))
-    blocks = list(_evaluate_in_blocks_of_steps(plant, tuple(functions.values()), u, steps)) if functions else []
-    for name, matrices in zip(functions, map(np.concatenate, zip(*blocks, strict=True)), strict=True):
+    if not functions or not len(u):
+        return
+    blocks = _evaluate_in_blocks_of_steps(plant, tuple(functions.values()), u, steps)
+    for name, matrices_by_block in zip(functions, zip(*blocks, strict=True), strict=True):
+        matrices = np.concatenate(matrices_by_block)  # of the function, at all steps
         is_covariance = name in COVARIANCES
         wrong = mask_invalid_covariances(matrices) if is_covariance else ~np.isfinite(matrices).all(axis=(1, 2))
         if wrong.any():
             row = int(np.argmax(wrong))
-            inputs = ", ".join(f"{name} = {x:.6g}" for name, x in zip(first(plant).inputs, u[row], strict=True))
+            inputs = ", ".join(f"{key} = {x:.6g}" for key, x in zip(first(plant).inputs, u[row], strict=True))
             where = f"row {row + 1}" if len(u) > 1 else f"step {steps[0]}"
             got = f"{_shorten(matrices[row])} in {where}, for {inputs}"
             raise fail(name, "a covariance" if is_covariance else "finite numbers", got)
@@ -222,7 +238,17 @@ def _evaluate_in_blocks_of_steps(
     u: Float[np.ndarray, "steps inputs"],
     steps: np.ndarray,
 ) -> Iterator[tuple[np.ndarray, ...]]:
-    """Yield what functions of the inputs return, for ROWS steps at a time, so that memory stays bounded."""
+    """Yield the matrices of some functions of the inputs, by blocks of at most ROWS steps: memory stays bounded.
+
+    Args:
+        plant: plant or sensor, constant or over time, whose matrices they are.
+        functions: each from (the model of a step, its inputs) to a matrix.
+        u: inputs of each step.
+        steps: number of each step.
+
+    Yields:
+        For a block, the matrices (steps of the block, n, m) of each function.
+    """
     for start in range(0, len(u), ROWS):
         yield _evaluate_at_steps(plant, functions, u[start : start + ROWS], steps[start : start + ROWS])
 
@@ -231,13 +257,19 @@ def _evaluate_in_blocks_of_steps(
 def _evaluate_at_steps(
     plant: AnyPlant | AnySensor, functions: tuple[ModelMatrixFunction, ...], u: Array, steps: Array
 ) -> Any:
-    """Return the matrices of each function at each step (steps, n, m), under the inputs u of that step.
+    """Return for each function its matrices at all steps (steps, n, m), under the inputs u of each step.
 
     It is compiled, since computing one operation after another is slow.
+
+    Args:
+        plant: plant or sensor, constant or over time.
+        functions: each from (the model of a step, its inputs) to a matrix.
+        u: inputs of each step (steps, inputs).
+        steps: number of each step (steps,).
     """
 
     def of_step(k: jax.Array, u_k: jax.Array) -> tuple[jax.Array, ...]:
-        """Return what the functions return at step k."""
+        """Return the matrix of each function at step k, whose inputs are u_k."""
         now = at(plant, k)
         return tuple(function(now, u_k) for function in functions)
 
@@ -245,13 +277,16 @@ def _evaluate_at_steps(
 
 
 def _shorten(value: np.ndarray) -> str:
-    """Return a matrix as text of at most MOST_SHOWN characters."""
+    """Return a matrix as text for an error message, cut to MOST_SHOWN characters."""
     shown = str(np.round(value, 12).tolist())
     return shown if len(shown) <= MOST_SHOWN else shown[: MOST_SHOWN - 3] + "..."
 
 
 def mask_invalid_covariances(values: Float[np.ndarray, "steps n n"]) -> np.ndarray:
-    """Return which matrices (steps, n, n) are not covariances, by the tolerances of `check.covariance`."""
+    """Return which of some matrices (steps, n, n) are not covariances, to rounding: (steps,), True for those.
+
+    A covariance is finite, symmetric and positive semidefinite. The tolerances are of correlations.
+    """
     is_finite = np.isfinite(values).all(axis=(1, 2))
     finite_values = np.where(is_finite[:, None, None], values, 0.0)
     deviations = standard_deviations(finite_values)  # so that tolerances do not depend on the states' units

@@ -31,15 +31,15 @@ def find_common_dates(tables: Mapping[str, object]) -> np.ndarray | None:
         dates = row_dates(name, rows)
         if dates is None:
             continue
-        # The first table with dates sets them; the others must have the same kind (dates or spans), and the same
-        # values. Tables of another length are refused elsewhere.
+        # The first table with dates sets them. The others must have the same kind of times, dates (NumPy's kind "M") or
+        # spans of time, and the same values.
         if common_dates is None:
             first_table, common_dates = name, dates
         elif dates.dtype.kind != common_dates.dtype.kind:
-            kinds = {"M": "dates"}
-            came, there = (kinds.get(times.dtype.kind, "spans of time") for times in (dates, common_dates))
+            came, there = ("dates" if t.dtype.kind == "M" else "spans of time" for t in (dates, common_dates))
             raise fail(f"times of {name}", f"{there}, as {first_table} has", came)
-        elif len(dates) == len(common_dates) and (dates != common_dates).any():  # other lengths are refused as such
+        elif len(dates) == len(common_dates) and (dates != common_dates).any():
+            # A table of another number of rows is refused where tables are read, by its number of rows.
             row = int(np.argmax(dates != common_dates))
             got = f"{dates[row]} in row {row + 1}, not {common_dates[row]}"
             raise fail(f"dates of {name}", f"those of {first_table}", got)
@@ -78,9 +78,12 @@ def read_row_dates(inputs: Sequence[str], tables: Mapping[str, object]) -> np.nd
 def _count_frames_up_to_user() -> int:
     """Return the `stacklevel` with which the caller's warning points at the user's line, outside this package.
 
-    It is the number of frames of this package from here upwards.
+    `stacklevel` is 1 for the caller itself, 2 for what called it, and so on. It is the number of frames of this package
+    from here upwards: this function, which is not above the warning, stands for the user's frame.
     """
-    package, depth, frame = __name__.split(".")[0], 0, inspect.currentframe()
+    package = __name__.split(".")[0]
+    frame, frames_of_package = inspect.currentframe(), 0
     while frame is not None and frame.f_globals.get("__name__", "").split(".")[0] == package:
-        frame, depth = frame.f_back, depth + 1
-    return depth
+        frames_of_package += 1
+        frame = frame.f_back
+    return frames_of_package

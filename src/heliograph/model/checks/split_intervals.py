@@ -57,8 +57,9 @@ def explain_uneven_prediction(plant: AbstractPlant, dt: int) -> str:
     cuts = np.array(CUTS)
     # At the initial mean, and one standard deviation from it.
     for x in (mean, mean + deviation):
-        # f, A and Q over s + t at once, and over s and then t, for every cut (s, t).
-        whole = _predict_over_intervals(plant, dt, x, cuts.sum(axis=1, keepdims=True))
+        # f, A and Q, each with an axis of cuts: over s + t as one interval, and over s and then t.
+        sums = cuts.sum(axis=1, keepdims=True)  # s + t of each cut (s, t)
+        whole = _predict_over_intervals(plant, dt, x, sums)
         parts = _predict_over_intervals(plant, dt, x, cuts)
         for i, (s, t) in enumerate(CUTS):
             for what, at_once, in_two in zip(("transition", "Jacobian", "noise"), whole, parts, strict=True):
@@ -100,10 +101,12 @@ def _predict_over_intervals(
         for interval in intervals:
             # The step over one interval: F = df/dx at the mean, with angles kept continuous.
             u = jnp.where(np.arange(len(plant.inputs)) == dt, interval, 1.0)
-            F, predicted = jax.jacfwd(plant.make_motion_about(u, mean))(mean), plant.transition(mean, u)
+            F = jax.jacfwd(plant.make_motion_about(u, mean))(mean)
+            predicted = plant.transition(mean, u)
             mean = plant.manifold.settle(predicted, predicted + plant.noise_mean())
             # F F_before, and F P F' + Q of the noise so far.
-            matrix, covariance = F @ matrix, F @ covariance @ F.T + plant.noise_covariance(u)
+            matrix = F @ matrix
+            covariance = F @ covariance @ F.T + plant.noise_covariance(u)
         return mean, matrix, covariance
 
     moved: tuple[jax.Array, jax.Array, jax.Array] = jax.vmap(integrate)(jnp.asarray(intervals))

@@ -14,10 +14,20 @@ StateLimitsLike = TypeAliasType("StateLimitsLike", "Mapping[str, Sequence[float 
 
 
 def read_intervals(limits: object, received: int, name: str = "limits") -> Float[np.ndarray, "m 2"]:
-    """Return (low, high) for each received number, infinite where there is no limit."""
-    everything = [-np.inf, np.inf]
+    """Return (low, high) for each received number, infinite where there is no limit, from limits as users give them.
+
+    Args:
+        limits: (low, high) for all received numbers, or such a pair for each, None in place of an end without a limit;
+            None for no limits.
+        received: how many numbers are received.
+        name: what the limits are called in errors.
+
+    Raises:
+        ValueError: what is no such pair or list of pairs, a low end that is not below the high one.
+    """
+    no_limits = [-np.inf, np.inf]
     if limits is None:
-        return np.tile(everything, (received, 1))
+        return np.tile(no_limits, (received, 1))
     expected = f"(low, high), or such a pair for each of {received} received numbers, None where there is no limit"
     try:
         values = np.asarray(limits, dtype=object)
@@ -26,7 +36,7 @@ def read_intervals(limits: object, received: int, name: str = "limits") -> Float
     if values.shape not in ((2,), (received, 2)):
         raise fail(name, expected, show_value(limits))
     rows = np.tile(values, (received, 1)) if values.ndim == 1 else values
-    pairs = [[end if bound is None else bound for bound, end in zip(row, everything, strict=True)] for row in rows]
+    pairs = [[end if bound is None else bound for bound, end in zip(row, no_limits, strict=True)] for row in rows]
     intervals = read_numbers(name, pairs, expected)
     if np.any(~(intervals[:, 0] < intervals[:, 1])):
         raise fail(name, "a low end below the high one", show_value(limits))
@@ -34,7 +44,16 @@ def read_intervals(limits: object, received: int, name: str = "limits") -> Float
 
 
 def read_numbers(name: str, value: object, expected: str = "numbers") -> Float[np.ndarray, "..."]:
-    """Return real numbers as an array of doubles; raise ValueError, with what was `expected` of `name`, for others."""
+    """Return a user's real numbers as an array of doubles.
+
+    Args:
+        name: what the value is called in errors.
+        value: a number, or numbers in any nesting; texts, truth values and ragged lists are refused.
+        expected: what is said in errors to be expected.
+
+    Raises:
+        ValueError: anything but real numbers.
+    """
     try:
         values = np.asarray(value)
         if values.size and values.dtype.kind not in "fiu":  # neither floats nor whole numbers, signed or not
@@ -73,10 +92,15 @@ def read_state_limits(
             raise fail("limits of states", f"names of states that are no angles, {no_angles}", show_value(name))
     # Read each interval: it must hold the initial mean (unless JAX traces this); infinite intervals are left out.
     read = []
-    for name in (name for name in states if name in given):
-        low, high = read_intervals([given[name]], 1, f"limits of {name!r}")[0].tolist()
-        if not is_traced(initial_mean) and not low <= (mean := float(initial_mean[states.index(name)])) <= high:
-            raise fail(f"limits of {name!r}", f"an initial mean within {low:g} to {high:g}", f"{mean:g}")
+    for i, name in enumerate(states):
+        if name not in given:
+            continue
+        (interval,) = read_intervals([given[name]], 1, f"limits of {name!r}")
+        low, high = interval.tolist()
+        if not is_traced(initial_mean):
+            mean = float(initial_mean[i])
+            if not low <= mean <= high:
+                raise fail(f"limits of {name!r}", f"an initial mean within {low:g} to {high:g}", f"{mean:g}")
         if np.isfinite([low, high]).any():
             read.append((str(name), (low, high)))
     return tuple(read)

@@ -32,9 +32,20 @@ def make_limits(
     sensor: AnySensor | None = None,
     channel: Channel | None = None,
 ) -> "ReadingLimits | None":
-    """Return the limits of so many received numbers; those of another node as they are; None where there are none.
+    """Return a node's rule of which received numbers count as missing, or None if it has none.
 
-    `stuck` of True is by the noise and resolution of the sensor, behind the channel.
+    Args:
+        received: how many numbers are received.
+        limits: lowest and highest valid numbers, None for no limits, or the whole rule of another node, which is
+            returned as it is.
+        invalid: codes that are no readings.
+        stuck: after how many equal readings a sensor counts as stuck (`find_stuck_counts`); True: by the noise and
+            resolution of the `sensor`.
+        sensor: the node's sensor, None where there is none.
+        channel: its channel, which must deliver readings as they are if `stuck` is True.
+
+    Raises:
+        ValueError: limits of another number of readings, or further codes beside those of another node.
     """
     codes, counts = read_numbers("invalid values", invalid), find_stuck_counts(received, stuck, sensor, channel)
     if isinstance(limits, ReadingLimits):
@@ -62,7 +73,7 @@ class ScreenedReadings(NamedTuple):
     repeats: Repeats
 
     def by(self, reason: Reason) -> Bool[np.ndarray, "time m"]:
-        """Return True for each that is refused for this reason (time, m)."""
+        """Return which readings are refused for this reason, such as "limits", "code" or "stuck" (time, m)."""
         return np.asarray(self.refused == number_of_reason(reason))
 
 
@@ -93,7 +104,15 @@ class ReadingLimits(Module):
         invalid: ArrayLike = (),
         stuck: Float[np.ndarray, " m"] | None = None,
     ):
-        """Check and hold which of `received` numbers count as missing; the class says what the arguments are."""
+        """Check and hold which received numbers count as missing: beyond limits, codes, or repeated too often.
+
+        Args:
+            received: length m of a measurement.
+            limits: (low, high) for all components or for each; None for no limits.
+            invalid: codes that are no measurements, a number or several.
+            stuck: for each component, how many equal readings in a row count as missing from then on; None for no such
+                rule.
+        """
         intervals = read_intervals(limits, received)
         self.low, self.high = intervals[:, 0], intervals[:, 1]
         codes = read_numbers("invalid values", invalid)
@@ -104,8 +123,8 @@ class ReadingLimits(Module):
     @property
     def bounded(self) -> bool:
         """Whether a number may count as missing for its value, which tells of the state as a code does not."""
-        limited = bool(np.any(np.isfinite(self.low)) or np.any(np.isfinite(self.high)))
-        return limited or self.stuck is not None
+        has_limits = bool(np.any(np.isfinite(self.low)) or np.any(np.isfinite(self.high)))
+        return has_limits or self.stuck is not None  # a run of equal readings is found by their values too
 
     def screen(self, z: Float[np.ndarray, "time m"], before: Repeats = FIRST) -> ScreenedReadings:
         """Return the readings without those that count as missing, from runs of equal readings before them (`before`).
@@ -129,7 +148,8 @@ class ReadingLimits(Module):
         A code is a value of `self.invalid`, such as -999, that stands for no reading; it counts as a code even beyond
         the limits (`self.low`, `self.high`). NaN is missing already and has no reason.
         """
-        is_code, is_beyond = equals_code(z, self.invalid), (z < self.low) | (z > self.high)
+        is_code = equals_code(z, self.invalid)
+        is_beyond = (z < self.low) | (z > self.high)
         return np.where(is_code, number_of_reason("code"), np.where(is_beyond, number_of_reason("limits"), 0))
 
     def outside(self, z: Float[np.ndarray, "... m"]) -> Bool[np.ndarray, "... m"]:
@@ -137,9 +157,12 @@ class ReadingLimits(Module):
         return np.asarray(self.find_refusal_reasons(z) > 0)
 
     def describe_missing(self, z: Float[np.ndarray, " m"], refused: Int[np.ndarray, " m"], names: Sequence[str]) -> str:
-        """Return in words which components of a measurement are refused, or "" if none is.
+        """Return in words which components of a measurement are refused, and why, or "" if none is.
 
-        `refused`: the number of each component's reason, as `screen` returns it.
+        Args:
+            z: the measurement, with the readings that are refused.
+            refused: the number of each component's reason, 0 if it is kept, as `screen` returns it.
+            names: names of the components.
         """
         descriptions = []
         for i in np.flatnonzero(refused).tolist():
@@ -155,11 +178,12 @@ class ReadingLimits(Module):
 
 
 def equals_code(z: ArrayLike, codes: Float[np.ndarray, " codes"]) -> Bool[np.ndarray, "..."]:
-    """Return whether each number is a code, a number such as -999 that stands for no reading.
+    """Return whether each number of z (...) is one of some codes, numbers such as -999 that stand for no reading.
 
-    Numbers count as equal up to the rounding of a product, and if single precision stores the code so.
+    A number counts as the code if it differs by the rounding of a product, as where a device scales whole numbers, or
+    if it is the code as single precision stores it.
     """
-    numbers = np.asarray(z, dtype=np.float64)[..., None]
+    numbers = np.asarray(z, dtype=np.float64)[..., None]  # compared with all codes along a last axis
     if not len(codes):
         return np.zeros(numbers.shape[:-1], dtype=bool)
     # ROUNDING, SINGLE: relative rounding of a product of doubles, and of a number in single precision. All but the

@@ -75,12 +75,15 @@ def count_repeats(z: Float[np.ndarray, "time m"], before: Repeats) -> tuple[Int[
         rows = np.flatnonzero(~np.isnan(z[:, i]))
         if len(rows) == 0:
             continue
-        readings, place = z[rows, i], np.arange(len(rows))
-        begins = readings != np.concatenate([[newest[i]], readings[:-1]])
-        # Place where the present run began; that of the run before these rows is before the first.
-        start = np.maximum.accumulate(np.where(begins, place, -lengths[i]))
-        counts[rows, i] = place - start + 1
-        newest[i], lengths[i] = float(readings[-1]), int(counts[rows[-1], i])
+        readings = z[rows, i]  # of this component, those that arrived
+        number = np.arange(len(rows))
+        begins = readings != np.concatenate([[newest[i]], readings[:-1]])  # a run: another reading than before it
+        # Number of the reading with which the present run began. A run that goes on from before these readings began
+        # with number -length: its readings before have the numbers -length to -1.
+        start = np.maximum.accumulate(np.where(begins, number, -lengths[i]))
+        counts[rows, i] = number - start + 1
+        newest[i] = float(readings[-1])
+        lengths[i] = int(counts[rows[-1], i])
     return counts, Repeats(tuple(newest), tuple(lengths))
 
 
@@ -120,17 +123,19 @@ def _bound_probability_within_step(
 ) -> Float[np.ndarray, " outputs"]:
     """Return the largest probability that the noise of each output lies in an interval as long as its `step`.
 
-    It is that of the interval around the mean. `step`: the least difference of two readings, such as a converter's.
+    It is that of the interval around the mean, P(|v| <= step / 2). `step`: the least difference of two readings, such
+    as a converter's.
     """
+    # Student's law: 1 - 2 F(-step / (2 scale)), F its distribution function.
     if isinstance(noise, StudentT):
         scale = np.sqrt(np.diagonal(np.asarray(noise.scale)))
         return np.asarray(1 - 2 * scipy.special.stdtr(float(noise.degrees), -step / (2 * scale)))
     if not isinstance(noise, Gaussian | Contaminated):
         raise fail("stuck", "Gaussian, Student's or contaminated noise, or a number of readings", type(noise).__name__)
-    # The noise is a mixture of Gaussians with these shares (as logarithms) and variances.
+    # A mixture of Gaussians with these shares (as logarithms) and variances r: erf(step / sqrt(8 r)) of each.
     log_share, _mean, variance = (np.asarray(numbers) for numbers in noise.branches())
     with np.errstate(divide="ignore"):
-        within_step = scipy.special.erf(step[:, None] / np.sqrt(8 * variance))  # of each Gaussian
+        within_step = scipy.special.erf(step[:, None] / np.sqrt(8 * variance))
     return np.asarray(np.sum(np.exp(log_share) * within_step, axis=1))
 
 
@@ -192,7 +197,18 @@ def find_stuck_counts(
 def _find_counts_by_noise_law(
     received: int, sensor: AnySensor | None, channel: Channel | None
 ) -> Float[np.ndarray, " received"]:
-    """Return the counts by the noise and resolution of a sensor, the largest of all its steps."""
+    """Return after how many equal readings each output of a sensor counts as stuck, by its noise and resolution.
+
+    Runs as long have the probability SELDOM by chance; of a sensor that varies over time the largest count holds.
+
+    Args:
+        received: how many numbers are received.
+        sensor: the sensor, with a resolution.
+        channel: its channel.
+
+    Raises:
+        ValueError: no sensor or channel, a channel that changes readings, noise by which equal readings are usual.
+    """
     steps = [step for step in unstack(sensor) if isinstance(step, AbstractSensor)]
     if not steps or channel is None:
         raise fail("stuck", "a number of equal readings, of what is received from no sensor", "True")

@@ -115,15 +115,15 @@ class Words(Module):
                 raise fail(f"{name} of the words", f"one number, or {outputs}", f"shape {np.shape(end)}")
 
     def each(self, values: Float[np.ndarray, "..."], outputs: int) -> Float[np.ndarray, " outputs"]:
-        """Return numbers that all components share, or that each has, as one for each."""
+        """Return an array (outputs,) of one number for each component, from one number for all or one for each."""
         values_of_outputs: np.ndarray = library(values).broadcast_to(values, (outputs,))
         return values_of_outputs
 
     def draw_dither(self, key: jax.Array, outputs: int) -> Float[jax.Array, " outputs"]:
-        """Draw the dither of one message: noise that is added to each output before it is rounded to a word.
+        """Draw the dither of one message: noise that is added to each of the outputs before it is rounded to a word.
 
-        It is none, uniform, or triangular (the sum of two uniform numbers), in units of `self.step`, the distance of
-        two words.
+        With the distance D of two words (`self.step`) it is 0 for "none"; D (u_1 + u_2 - 1) for "triangular", with u_1
+        and u_2 uniform from 0 to 1; and D (u_1 - 1/2) for "stochastic" and "subtracted".
         """
         uniform = jax.random.uniform(key, (2, outputs), dtype=float)  # two numbers from 0 to 1 for each output
         match self.dither:
@@ -135,16 +135,19 @@ class Words(Module):
                 return jnp.asarray(self.step) * (uniform[0] - 0.5)
 
     def index(self, y: jax.Array) -> jax.Array:
-        """Return the number i of the word nearest to each component of y, a whole number as a float."""
+        """Return the number i of the word nearest to each component of y, a whole number as a float.
+
+        Beyond the range it is that of the end word.
+        """
         place = jnp.floor((y - jnp.asarray(self.low)) / jnp.asarray(self.step) + 0.5)
         return jnp.clip(place, 0.0, 2.0**self.bits - 1)
 
     def word(self, index: jax.Array) -> jax.Array:
-        """Return the word of number i."""
+        """Return the word q = low + i D of each component from its number i."""
         return jnp.asarray(self.low) + index * jnp.asarray(self.step)
 
     def signs(self, index: jax.Array) -> Float[jax.Array, "outputs bits"]:
-        """Return the bits of each word, the lowest first: 1 of a zero, -1 of a one."""
+        """Return the bits of words of given numbers i (outputs,) as signs, the lowest bit first: 1 - 2 b of a bit b."""
         powers = 2.0 ** np.arange(self.bits)
         return 1 - 2 * jnp.mod(jnp.floor(index[:, None] / powers), 2.0)
 
@@ -196,7 +199,7 @@ class Words(Module):
 
 
 def _read_range_end(name: str, value: ArrayLike) -> Float[np.ndarray, "..."]:
-    """Return an end of the range, of all components or one for each."""
+    """Return the low or high end of the words' range as an array: one number for all components, or one for each."""
     return cast(np.ndarray, array(f"{name} of the words", value, (None,) if rank(name, value) else ()))
 
 
@@ -208,7 +211,10 @@ def _checksum_node_name(node: str) -> int:
 
 
 def _mix_bits(state: np.ndarray) -> np.ndarray:
-    """Return 64 bits mixed by a round of splitmix64 (Steele, Lea and Flood 2014)."""
+    """Return 64-bit numbers whose bits are mixed by the finalizer of the generator splitmix64, as unsigned integers.
+
+    Numbers that differ in one bit become numbers that look unrelated. Source: Steele, Lea and Flood (2014).
+    """
     state = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     state = (state ^ (state >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return cast(np.ndarray, state ^ (state >> np.uint64(31)))

@@ -79,7 +79,10 @@ def rewrite_about_centres(encoder: Words, channel: Channel) -> Channel:
     """
 
     def convert(link: AbstractRandomAffine) -> AbstractRandomAffine:
-        """Return the link of one step as a map of the numbers q - c, one for each component of y."""
+        """Return a link of codewords as a map of one number q - c for each, q the word and c the range's centre.
+
+        A link that flips bits needs the variance U of a word, which `encoder.power` gives for each component of y.
+        """
         power = encoder.each(encoder.power, signal_size(link))  # U by component of y
         form = WordForm(
             flips=lambda flips, components: flips.about_centre(power[list(components)]), selection=known, size=1
@@ -132,12 +135,13 @@ def _rewrite_map(link: AbstractRandomAffine, components: Components, form: WordF
         form: how flips and selections are written, and how many numbers a codeword is.
     """
     match link:
-        case Flips():
+        case Flips():  # flips bits of codewords, and neither selects nor moves them
             return RewrittenMap(form.flips(link, components), components)
         case GainAndNoise():
             return _rewrite_selection(link, components, form)
-        case ModeOutput():  # tells the present mode of a memory; its outputs are flags, which stand for no component
-            return RewrittenMap(ModeOutput(link.memory, link.sent * form.size), (FLAG,) * link.outputs)
+        case ModeOutput():  # reports the mode of a fading whatever is sent: its outputs are flags, and no codewords
+            numbers_sent = link.sent * form.size
+            return RewrittenMap(ModeOutput(link.memory, numbers_sent), (FLAG,) * link.outputs)
         case Series():
             return _rewrite_series(link, components, form)
         case Stack():
@@ -181,7 +185,11 @@ def _rewrite_selection(link: GainAndNoise, components: Components, form: WordFor
 def _rewrite_series(link: Series, components: Components, form: WordForm) -> RewrittenMap:
     """Return maps in series as maps of the numbers of their codewords, and the components that the last one delivers.
 
-    `components` are those that the first map gets. Each map gets the components that the previous one delivers.
+    Args:
+        link: the maps in series.
+        components: for each codeword at the input of the first map, the index in y of its component. Each further map
+            gets the components that the map before it delivers.
+        form: how a codeword is written as numbers.
     """
     maps = []
     for inner in link.maps:
@@ -194,8 +202,11 @@ def _rewrite_series(link: Series, components: Components, form: WordForm) -> Rew
 def _rewrite_choice(link: AbstractOneOfSeveralMaps, components: Components, form: WordForm) -> RewrittenMap:
     """Return a choice among maps as a choice among maps of the numbers of their codewords, and its components.
 
-    All maps get the same `components`. All must deliver the same, since the receiver does not see which was chosen:
-    otherwise ValueError is raised.
+    All maps get the same `components`: for each codeword at their input, the index in y of its component. `form` says
+    how a codeword is written as numbers.
+
+    Raises:
+        ValueError: maps that deliver other components, since the receiver does not see which map was chosen.
     """
     choices = [_rewrite_map(inner, components, form) for inner in link.maps]
     if len({choice.components for choice in choices}) > 1:
