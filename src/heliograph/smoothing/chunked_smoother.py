@@ -42,9 +42,11 @@ class SmoothedRows(NamedTuple):
 
 
 def smooth_in_chunks(filter: Any, z: Array, u: Array) -> SmoothedRows | None:
-    """Smooth rows in chunks side by side; None if rows are few, or the filter is not linear or forgets too slowly.
+    """Smooth a long recording in chunks of rows that are computed in parallel; None if it cannot be divided so.
 
-    A filter forgets its start if any two states lead to the same state after enough rows.
+    A chunk may begin with any state some rows before its own, if the filter forgets its start: any two states lead to
+    the same state after enough rows. The result is None if rows are few, or the filter is not linear or forgets too
+    slowly; the caller then smooths row after row.
 
     Args:
         filter: the filter, which can be smoothed.
@@ -55,7 +57,7 @@ def smooth_in_chunks(filter: Any, z: Array, u: Array) -> SmoothedRows | None:
     if start is None:
         return None
     with jax.enable_x64(True):
-        # The length of chunks, their own rows, is known only after their starts.
+        # How long chunks are is known only after their starts are found, which need no length (own=0).
         chunk_starts = find_chunk_starts(SmootherStepRecursion(filter, own=0), start, rows)
         if chunk_starts is None:
             return None
@@ -71,7 +73,7 @@ def smooth_chunk(
     later: Gaussian,
     is_given: Array,
 ) -> SmoothedChunk:
-    """Smooth a chunk's own rows by all data up to row `end`: filter ahead, then pass back.
+    """Smooth a chunk's own rows by all data before row `end`: a filter's pass ahead, then a smoother's pass back.
 
     Args:
         recursion: the filter over rows, and how many rows are the chunk's own.
@@ -83,6 +85,7 @@ def smooth_chunk(
         is_given: whether `later` is used.
     """
     own = recursion.own
+    # The smoother step of each row: of the chunk's own rows, and of the rows after them.
     state_at_end, steps = scan_chunk(recursion, state, take(rows, slice(own)), first, end)
     last_state, steps_after = scan_chunk(recursion, state_at_end, take(rows, slice(own, None)), first + own, end)
 
@@ -97,8 +100,8 @@ def smooth_chunk(
         law_before, _ = pass_back(law, item)
         return law_before, step.estimate_from(law)
 
-    k = first + jnp.arange(len(rows[0]))
-    law = select_state(is_given, later, gaussian_of(last_state))
+    k = first + jnp.arange(len(rows[0]))  # row numbers
+    law = select_state(is_given, later, gaussian_of(last_state))  # the law with which the backward pass begins
     law_after, _ = jax.lax.scan(pass_back, law, (steps_after, k[own:]), reverse=True)
     law_before, estimate = jax.lax.scan(pass_back_and_estimate, law_after, (steps, k[:own]), reverse=True)
     return SmoothedChunk(
@@ -111,11 +114,12 @@ def smooth_chunk(
     )
 
 
-# Arguments: first states of chunks, which chunks, and the smoothed laws after them (the filtered ones if left out).
+# Smooths some chunks. Arguments: states before their first rows, which chunks they are, and the smoothed laws after
+# their last rows (if left out, the backward pass begins later, with the filtered law).
 SmoothChunks = Callable[..., SmoothedChunk | None]
 
 
-def _smooth_all(recursion: SmootherStepRecursion, begun: ChunkStarts, rows: PyTree) -> SmoothedRows | None:
+def _smooth_all(recursion: SmootherStepRecursion, chunk_starts: ChunkStarts, rows: PyTree) -> SmoothedRows | None:
     """Smooth all chunks side by side, then again those whose ends differ from their neighbours'.
 
     A chunk smooths its `own` rows by a window of these and the `ahead` rows after them. It filters its window and
@@ -124,16 +128,17 @@ def _smooth_all(recursion: SmootherStepRecursion, begun: ChunkStarts, rows: PyTr
 
     Args:
         recursion: one step of the filter and of its smoother.
-        begun: for each chunk its first row and a state to begin with, the numbers `own` and `ahead`, and whether
-            covariances have settled there: rows without missing numbers then change only means.
+        chunk_starts: for each chunk its first row and a state to begin with, the numbers `own` and `ahead`, and
+            whether covariances have settled there: rows without missing numbers then change only means.
         rows: measurements and inputs, (rows, ...) each.
 
     Returns:
         The smoothed estimates of all rows; None without native code for a chunk.
     """
-    total, (own, ahead) = len(rows[0]), begun.lengths
-    windows = take_windows(rows, begun.first, own + ahead)
-    window_ends = np.minimum(begun.first + own + ahead, total)
+    total = len(rows[0])
+    own, ahead = chunk_starts.lengths
+    windows = take_windows(rows, chunk_starts.first, own + ahead)
+    window_ends = np.minimum(chunk_starts.first + own + ahead, total)
 
     def smooth_chunks_from(states: PyTree, which: Which, later: Gaussian | None = None) -> SmoothedChunk | None:
         """Filter the chunks `which` from their first states, then smooth them; None without native code.
@@ -141,7 +146,7 @@ def _smooth_all(recursion: SmootherStepRecursion, begun: ChunkStarts, rows: PyTr
         The backward pass begins at the end of each chunk's window, which is before the row `window_ends`. If `later` is
         given, the smoothed law after each chunk's own rows, it begins there.
         """
-        first = begun.first[which]
+        first = chunk_starts.first[which]
         is_given = np.full(len(first), later is not None)
         if later is None:
             pass_back_from, laws = window_ends[which], gaussian_of(states)  # these laws are not used
@@ -153,19 +158,20 @@ def _smooth_all(recursion: SmootherStepRecursion, begun: ChunkStarts, rows: PyTr
 
     def smooth_means(settled: SettledState) -> SmoothedChunk | None:
         """Smooth all chunks by their means alone, with the covariances and gains of `settled`."""
-        return smooth_settled_chunks(recursion, settled, begun, windows)
+        return smooth_settled_chunks(recursion, settled, chunk_starts, windows)
 
     # Only means are computed in chunks where covariances have settled: their window must be complete, and must not
     # reach beyond the last row.
-    is_complete = begun.complete.are_complete(begun.first, own + ahead) & (begun.first + own + ahead <= total)
-    begun = begun._replace(covered=begun.covered & is_complete)
-    results = scan_means_where_settled(begun, smooth_chunks_from, smooth_means)
+    first = chunk_starts.first
+    is_complete = chunk_starts.complete.are_complete(first, own + ahead) & (first + own + ahead <= total)
+    chunk_starts = chunk_starts._replace(covered=chunk_starts.covered & is_complete)
+    results = scan_means_where_settled(chunk_starts, smooth_chunks_from, smooth_means)
     if results is None:
         return None
     # Results are repaired in place. From the first chunk on: each chunk that began in another state than that in which
     # the chunk before it ends. Then from the last one back: each chunk whose smoothed law at its end is wrong.
-    rescan_wrong_starts(smooth_chunks_from, begun.states, lambda results: results.end, results)
-    _resmooth_wrong_ends(smooth_chunks_from, begun.states, results)
+    rescan_wrong_starts(smooth_chunks_from, chunk_starts.states, lambda results: results.end, results)
+    _resmooth_wrong_ends(smooth_chunks_from, chunk_starts.states, results)
     leaves = results.estimate, results.nis, results.received  # (chunks, own, ...) each
     estimate, nis, received = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:total], leaves)
     return SmoothedRows(estimate, np.asarray(sum_nis_over_blocks(nis, received)))
