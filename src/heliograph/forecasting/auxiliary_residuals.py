@@ -51,10 +51,10 @@ class Disturbances:
     Args:
         outputs: names of the outputs, m of them.
         states: names of the states, n of them.
-        output_noise: noise of each output given all data, without its mean (steps, m).
-        output_deviation: its standard deviation (steps, m).
-        state_noise: noise of the plant on the way to each row, without its mean (steps, n).
-        state_deviation: its standard deviation (steps, n).
+        output_noise: smoothed noise of each output, its mean given all data less that before any (steps, m).
+        output_deviation: standard deviation with which that mean varies from one recording to another (steps, m).
+        state_noise: smoothed noise of the plant on the way to each row, likewise (steps, n).
+        state_deviation: standard deviation with which that mean varies (steps, n).
     """
 
     outputs: tuple[str, ...]
@@ -66,13 +66,19 @@ class Disturbances:
 
     @property
     def output_residuals(self) -> Float[np.ndarray, "steps m"]:
-        """Auxiliary residuals of the outputs, noise / deviation (steps, m): normal of variance 1, not independent."""
+        """Auxiliary residuals of the outputs, noise / deviation (steps, m); a large one marks an outlier.
+
+        Where the model is right they are normal of variance 1, but not independent of each other.
+        """
         residuals: np.ndarray = self.output_noise / self.output_deviation
         return residuals
 
     @property
     def state_residuals(self) -> Float[np.ndarray, "steps n"]:
-        """Auxiliary residuals of the states, noise / deviation (steps, n): normal of variance 1, not independent."""
+        """Auxiliary residuals of the states, noise / deviation (steps, n); a large one marks a break of a state.
+
+        Where the model is right they are normal of variance 1, but not independent of each other.
+        """
         residuals: np.ndarray = self.state_noise / self.state_deviation
         return residuals
 
@@ -90,7 +96,7 @@ class Disturbances:
         """
         level = float(scalar("false", false, 0, 1))
         residuals = np.concatenate([self.output_residuals, self.state_residuals], axis=1)
-        size = np.nan_to_num(np.abs(residuals))
+        size = np.nan_to_num(np.abs(residuals))  # (steps, m + n); 0 where data say nothing
         # Each finite residual is tested on both sides, and the tests share the probability (Bonferroni).
         tests = 2 * np.isfinite(residuals).sum()
         p = np.minimum(tests * ndtr(-size), 1.0)

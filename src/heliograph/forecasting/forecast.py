@@ -17,9 +17,8 @@ from heliograph.forecasting.multistep_prediction import (
     find_output_claim,
     find_received_claim,
     make_multistep_predictor,
-    predict_moments,
-    predict_moments_of_each,
 )
+from heliograph.forecasting.predicted_moments import predict_moments, predict_moments_of_each
 from heliograph.forecasting.start_states import Sources, find_common_origin
 from heliograph.model.augmented.joint_sensors import joint_sensor
 from heliograph.model.estimate import Estimate, weakest
@@ -84,9 +83,12 @@ def forecast_from_origin(origin: Origin, horizons: Horizons, inputs: Inputs) -> 
 class ForecastTarget(NamedTuple):
     """An estimate that is forecast.
 
-    node, filter: names of its node and filter. predictor: predicts the filter's state without data, and reads states,
-    outputs and received numbers from it. state: the filter's state where the data end. received: names of the numbers
-    that the filter receives.
+    Args:
+        node: name of its node; "" of a single filter.
+        filter: name of its filter; "" of a single filter.
+        predictor: predicts the filter's state without data, and reads states, outputs and received numbers from it.
+        state: the filter's state where the data end.
+        received: names of the numbers that the filter receives.
     """
 
     node: str
@@ -114,7 +116,8 @@ def find_target(origin: Origin, node: str | None, filter: str | None) -> Forecas
 def list_targets(origin: Origin) -> list[ForecastTarget]:
     """Return what is forecast from an origin: each of its estimates, with the filter and state that are predicted.
 
-    A single filter has one, of node and filter "".
+    `origin` is where the data end: a network with its filters' states and estimates, or a single filter with its state,
+    which has one target, of node and filter "".
     """
     model = origin.model
     if isinstance(model, AbstractFilter):
@@ -151,7 +154,8 @@ def _find_filter(
     """
     states_by_stack, states_of_central, *_ = origin.state
     if (node, name) in network.estimate_indices:
-        # In a stack, of filters of one structure: filter after filter, and for each the nodes of the stack's group.
+        # States of filters of one structure are stacked: those of the first filter at each node of the stack's group,
+        # then those of the next filter.
         stack, filter_of_stack, node_of_group = network.estimate_indices[node, name]
         nodes_in_group = len(network.groups[network.stacks[stack].group])
         index = filter_of_stack * nodes_in_group + node_of_group
@@ -164,18 +168,19 @@ def _find_filter(
 
 
 def _take_stacked_state(stacked: PyTree, index: int, several: bool) -> PyTree:
-    """Return one of the states that are stacked along the first axis, or along the second if the first is of plants.
+    """Return the state number `index` of stacked states.
 
-    `several` is True if there are several plants, which then have the first axis.
+    They are stacked along the first axis; if there are `several` plants these have the first, and states the second.
     """
     return jax.tree.map(lambda leaf: np.take(leaf, index, axis=int(several)), stacked)
 
 
 def _predict_without_nodes(network: Network, estimate: Estimate) -> tuple[AbstractFilter, PyTree]:
-    """Return a filter that only predicts, and its state at a fused estimate.
+    """Return a filter that only predicts, and its state: the law with the mean and covariance of a fused estimate.
 
-    It has the claim of the estimate, lowered to "nominal" if the prediction is approximate: if the plant is not linear
-    or has angles.
+    A fusion rule combines estimates and has no state of its own, so its forecast is the plant's motion from there. The
+    filter has the claim of the estimate, lowered to "nominal" if the prediction is approximate: if the plant is not
+    linear or has angles.
     """
     plant = first(network.plant)
     is_exact = isinstance(plant, LinearPlant) and not plant.circular
@@ -195,7 +200,10 @@ _factor_each = compile_in_float64(jax.vmap(lambda mean, covariance: from_covaria
 
 
 def _find_sensor(network: Network, node: str) -> AnySensor | None:
-    """Return the sensor of a node, or for FUSED (all nodes together) the joint one; None without constant sensors."""
+    """Return the sensor of a node, or for FUSED (all nodes together) the joint one.
+
+    None if a node has no sensor of its own, or if there is no joint one because a sensor varies over time.
+    """
     if node != FUSED:
         single = network.nodes[node]
         return single.sensor if isinstance(single, Node) else None
@@ -215,10 +223,14 @@ def _name_received(network: Network, node: str) -> tuple[str, ...]:
 
 
 def check_steps_covered(filter: AbstractFilter, step: int | np.ndarray, count: int) -> None:
-    """Raise ValueError if what varies over time ends earlier than `count` steps after `step`."""
-    last_step = int(np.max(step))
-    if filter.horizon is not None and last_step + count > filter.horizon:
-        covered = max(filter.horizon - last_step, 0)
+    """Raise ValueError if models that vary over time do not cover `count` steps from the step number `step` on.
+
+    `step`: number of the first step ahead, or one for each plant. `filter.horizon`: how many steps the models cover,
+    None if they do not vary.
+    """
+    first_ahead = int(np.max(step))  # of several plants that of the one that is furthest on
+    if filter.horizon is not None and first_ahead + count > filter.horizon:
+        covered = max(filter.horizon - first_ahead, 0)
         raise fail("horizons", f"at most {covered} steps, which the model covers beyond the data", count)
 
 

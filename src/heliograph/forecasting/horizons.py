@@ -37,11 +37,12 @@ class HasInputs(Protocol):
 class RowsAhead(NamedTuple):
     """Rows to predict over, and which of them the horizons are.
 
-    u: inputs of each row. rows: number of the row that ends at each horizon. steps: how far each horizon is, in steps
-    or in the unit of dt. time: of each, on the clock of the data. inputs: whether they are "given", "held" or there
-    are none.
-
-    Of several plants u and time have a leading axis.
+    Args:
+        u: inputs of each row ([plants,] rows, inputs); the leading axis is there only of several plants.
+        rows: index of the row that ends at each horizon (horizons,).
+        steps: how far each horizon is (horizons,), in steps or in the unit of the input dt.
+        time: time of each horizon on the clock of the data, numbers or dates ([plants,] horizons).
+        inputs: whether u was "given", repeats the last inputs ("held"), or the plant has none but dt ("none").
     """
 
     u: Float[np.ndarray, "... rows inputs"]
@@ -52,7 +53,7 @@ class RowsAhead(NamedTuple):
 
 
 def find_rows_ahead(origin: Origin, names: Sequence[str], horizons: Horizons, inputs: Inputs) -> RowsAhead:
-    """Return the rows of inputs over which a filter predicts from an origin to each horizon.
+    """Return the rows of inputs over which a filter predicts from an origin, and which of these rows the horizons are.
 
     Where time counts steps there is one row for each step. Where the plant has an input dt (time is continuous), there
     is one row for each horizon, with dt from the horizon before.
@@ -261,7 +262,13 @@ def _complete_inputs(
 def check_inputs_ahead(names: Sequence[str], ahead: RowsAhead, models: object, step: int | np.ndarray) -> None:
     """Raise ValueError if a function of the models returns an invalid value for the inputs ahead.
 
-    `names`: names of the inputs. `step`: number of the last row, or one for each plant.
+    Models may hold functions of the inputs, such as a matrix A(u). They are called with each row of `ahead.u`.
+
+    Args:
+        names: names of the inputs.
+        ahead: the rows ahead with their inputs.
+        models: a tree of plant, sensor and channel, or a filter that holds them.
+        step: number of the first row ahead, or one for each plant.
     """
     count, width = ahead.u.shape[-2:]
     if width:
@@ -272,10 +279,11 @@ def check_inputs_ahead(names: Sequence[str], ahead: RowsAhead, models: object, s
 def _place_on_clock(origin: Origin, distances: np.ndarray, continuous: bool) -> np.ndarray:
     """Return the time of each horizon on the clock of the data ([plants,] horizons): numbers or dates.
 
-    `distances`: how far ahead each is, in steps or if `continuous` in the unit of dt.
-
-    `spacing`: length of a step, of dates in seconds, NaN where none is usual; `months`: how many whole months a
-    step has, 0 if it is none.
+    Args:
+        origin: where the data end: `time` of the last row; `spacing`, the length of a step, of dates in seconds, NaN
+            where none is usual; `months`, how many whole months a step has, 0 if it is none.
+        distances: how far ahead each horizon is (horizons,), in steps or if `continuous` in the unit of dt.
+        continuous: whether the plant has an input dt, the time to the next step.
     """
     spacing = 1.0 if continuous else origin.spacing
     end = np.asarray(origin.time)[..., None]
@@ -287,9 +295,13 @@ def _place_on_clock(origin: Origin, distances: np.ndarray, continuous: bool) -> 
         return check_dates("horizons", last + ahead)
     if np.isnan(spacing):
         return np.full((*end.shape[:-1], len(distances)), np.datetime64("NaT", "ns"))
-    # Whole seconds first, in which no date overflows, then the rest, less than two: nanoseconds end in 2262.
-    seconds, rounded_up = np.minimum(spacing * distances, FARTHEST), np.timedelta64(2, "s")
-    last, whole = end.astype("datetime64[s]"), np.floor(seconds)
-    dates = check_dates("horizons", last + whole.astype(np.int64).astype("timedelta64[s]") + rounded_up) - rounded_up
-    rest = np.round(SECOND * (seconds - whole)).astype(np.int64).astype("timedelta64[ns]")
-    return np.asarray(dates + (end.astype("datetime64[ns]") - last) + rest)
+    # The result is in nanoseconds, which end in 2262. Whole seconds are added first, as in seconds no date overflows.
+    # `check_dates` tests the sum with 2 s to spare, as the fractions of the end and of the distance are added last.
+    seconds = np.minimum(spacing * distances, FARTHEST)
+    whole_seconds = np.floor(seconds)
+    last_second, spare = end.astype("datetime64[s]"), np.timedelta64(2, "s")
+    dates = last_second + whole_seconds.astype(np.int64).astype("timedelta64[s]")
+    checked = check_dates("horizons", dates + spare) - spare
+    fraction_of_end = end.astype("datetime64[ns]") - last_second
+    fraction = np.round(SECOND * (seconds - whole_seconds)).astype(np.int64).astype("timedelta64[ns]")
+    return np.asarray(checked + fraction_of_end + fraction)

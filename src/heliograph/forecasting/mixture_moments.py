@@ -40,7 +40,10 @@ class Moments(NamedTuple):
 
 
 def spread_over_branches(weights: Array, means: Array, variances: Array, branches: GaussianBranches) -> MarginalLaws:
-    """Return the laws of numbers plus a noise that is a mixture of Gaussians: one part for each pair of parts.
+    """Return the law of each number x + noise, where x is a mixture of K Gaussians and the noise one of J.
+
+    The sum is a mixture of K J Gaussians: pair (k, j) has the product of the weights, and the sums of the means and of
+    the variances.
 
     Args:
         weights: weights (K,) of the parts of the numbers without the noise.
@@ -48,10 +51,10 @@ def spread_over_branches(weights: Array, means: Array, variances: Array, branche
         variances: variances (K, m) of each number in each part, without the noise.
         branches: log shares, means and variances (m, J) of the noise's Gaussians, about its mean.
     """
-    share, mean, variance = (jnp.asarray(one).T for one in branches)  # (J, m)
-    pairs = (len(weights) * len(share), means.shape[-1])
+    log_share, mean, variance = (jnp.asarray(one).T for one in branches)  # (J, m)
+    pairs = (len(weights) * len(log_share), means.shape[-1])  # (K J, m)
     return MarginalLaws(
-        weights=(jnp.asarray(weights)[:, None, None] * jnp.exp(share)).reshape(pairs),
+        weights=(jnp.asarray(weights)[:, None, None] * jnp.exp(log_share)).reshape(pairs),
         means=(jnp.asarray(means)[:, None] + mean).reshape(pairs),
         variances=(jnp.asarray(variances)[:, None] + variance).reshape(pairs),
     )
@@ -83,9 +86,9 @@ def make_prediction(
     means = wrap_near(means, means[..., :1, :], angles)  # within half a turn of the first part, to be averaged
     # Moments of the mixture: mean = sum_k w_k m_k, covariance = sum_k w_k (P_k + (m_k - mean) (m_k - mean)').
     mean = np.einsum("...k,...km->...m", weights, means)
-    apart = means - mean[..., None, :]
+    distances = means - mean[..., None, :]
     within = np.einsum("...k,...kij->...ij", weights, covariances)
-    covariance = within + np.einsum("...k,...ki,...kj->...ij", weights, apart, apart)
+    covariance = within + np.einsum("...k,...ki,...kj->...ij", weights, distances, distances)
     if claim == "none":
         covariance, variances = np.full_like(covariance, np.nan), np.full_like(variances, np.nan)
     # The law of each number by itself: of these parts, or that in `laws`, whose variances count where one is known.
@@ -98,9 +101,9 @@ def make_prediction(
     # Angles of the mean come to -pi ... pi, and the parts' means move by the same whole turns.
     wrapped = wrap_angles(mean, angles)
     whole_turns = (wrapped - mean)[..., None, :]
-    ends = np.tile([-np.inf, np.inf], (len(names), 1))
-    for place, *interval in limits:
-        ends[place] = interval
+    ends = np.tile([-np.inf, np.inf], (len(names), 1))  # lowest and highest value of each number
+    for index, low, high in limits:
+        ends[index] = low, high
     return Prediction(
         names=names,
         mean=wrapped,

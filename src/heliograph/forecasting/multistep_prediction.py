@@ -9,9 +9,8 @@ from typing import Protocol, runtime_checkable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from heliograph.engine.choice import choose_code, compile_on_call, compute_once
+from heliograph.engine.choice import compile_on_call
 from heliograph.factors.diffuse_gaussian import Diffuse, mark_unknown, project_diffuse
 from heliograph.factors.factored_gaussian import Gaussian, from_covariance, take_leading
 from heliograph.filters.base import AbstractFilter
@@ -34,15 +33,12 @@ from heliograph.model.fading import without_memory
 from heliograph.model.over_time import OverTime, at, at_each_step, first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor, LinearSensor
-from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
 from heliograph.random_affine.memories_of_channels import memories
 from heliograph.random_affine.moments.mixture_components import GaussianBranches
 from heliograph.random_affine.noises.noise import AbstractNoise
 from heliograph.random_affine.noises.outlier_noise import StudentT
-
-BLOCK = 128  # plants side by side under XLA
 
 
 @runtime_checkable
@@ -57,8 +53,16 @@ class HasComponents(Protocol):
 class MultistepPredictor(Module):
     """Predicts a filter's state step by step without data, and reads moments from it.
 
-    plant, sensor: what is measured; without them no outputs are predicted. transform: takes moments through a nonlinear
-    sensor. receives: whether received numbers are predicted. received_noise: their noise if it has outliers, else None.
+    Three kinds of numbers are predicted: the plant's states, the outputs that its sensor would measure, and the numbers
+    that would be received of these through the channel.
+
+    Args:
+        filter: the filter whose state is predicted.
+        plant: the plant, for the outputs; None if it is not known.
+        sensor: the sensor of the outputs; None if it is not known, and no outputs are predicted.
+        transform: takes mean and covariance through a nonlinear sensor.
+        receives: whether received numbers are predicted.
+        received_noise: noise in the received numbers if it has outliers, else None.
     """
 
     filter: AbstractFilter
@@ -142,6 +146,7 @@ class MultistepPredictor(Module):
         filter, prior_within_limits = _condition_on_limits(self.filter, prior)
         if isinstance(filter, MultipleModelFilter) and memories((self.plant, self.sensor)):
             return _measure_in_each_mode(filter, prior_within_limits, k)
+        # The models of step k; `under` gives the sensor for these inputs.
         plant, initial_moments = at(self.plant, k), second_moments_at_start(self.plant)
         sensor = at(self.sensor, k).under(plant.inputs, u)
         # Of a start that is not known yet some outputs have infinite variances; sensors are linear there.
@@ -176,6 +181,9 @@ class MultistepPredictor(Module):
         self, states: Moments, outputs: Moments, noise: AbstractNoise, deviations: jax.Array | None
     ) -> MarginalLaws | None:
         """Return the law of each output if the sensor's noise is a mixture of Gaussians; None if it is Gaussian.
+
+        An output is what is measured without noise, with the variances of `outputs` less those of the noise, plus the
+        noise: a Gaussian for each pair of a Gaussian of the states and one of the noise ("branches").
 
         Args:
             states: moments of the states.
@@ -219,7 +227,11 @@ class MultistepPredictor(Module):
         return moments._replace(laws=laws)
 
     def predict_step(self, state: PyTree, u: jax.Array, k: jax.Array) -> tuple[PyTree, tuple[Moments | None, ...]]:
-        """Return the state predicted over step k, and the moments of states, outputs and received numbers there."""
+        """Return the filter's state predicted over step k, and the moments of the plant there.
+
+        The moments are those of the states, the sensor's outputs and the received numbers, in this order; the last two
+        are None where they are not predicted. `u`: inputs of the step (inputs,).
+        """
         prior = self.filter.predict(state, u, k)
         states = self.compute_state_moments(prior)
         outputs = self.predict_measured(prior, states, u, k)
@@ -268,8 +280,9 @@ def make_multistep_predictor(
     """Return what predicts a filter's states, the sensor's outputs and the received numbers several steps ahead.
 
     It takes the plant and sensor for which the filter was made, or the arguments if the filter does not know them.
-    Received numbers are not predicted if the filter receives none, or if it also uses that nothing arrives. Nor are
-    they if z tells the mode: E[z] is found by a correction with zeros, which would stand for a mode.
+    Received numbers z are not predicted if the filter receives none, or if it also uses that nothing arrives (a sender
+    that decides when to send). Nor are they if z has the number of the channel's mode in it: E[z] is found by a
+    correction with z = 0, which would stand for a mode.
     """
     assumed = filter.assumed  # the models for which the filter was made
     plant = plant if assumed is None else assumed.plant
@@ -316,65 +329,6 @@ def _find_received_noise(filter: AbstractFilter) -> ReceivedNoise | OverTime | N
 def _compute_moments_now(predictor: MultistepPredictor, state: PyTree) -> Moments:
     """Return the moments of the plant's states in a filter's `state`, before they are conditioned on limits."""
     return predictor.compute_moments_before_limits(state)
-
-
-def predict_moments(
-    predictor: MultistepPredictor, state: PyTree, u: np.ndarray, step: int | np.ndarray
-) -> tuple[Moments | None, ...]:
-    """Return the moments of states, outputs and what arrives at each row ahead (rows, K, ...).
-
-    Native code computes them if it supports the filter. `state`: the filter's state at `step`. `u`: inputs
-    (rows, inputs).
-    """
-    arguments = predictor, state, np.asarray(u, dtype=float), np.asarray(step)
-    moments: tuple[Moments | None, ...] = compute_once(_predict_moments, _by_xla, arguments)
-    return moments
-
-
-def predict_moments_of_each(
-    predictor: MultistepPredictor, state: PyTree, u: np.ndarray, step: int | np.ndarray
-) -> tuple[Moments | None, ...]:
-    """Return the moments of several plants at each row ahead (plants, rows, K, ...), computed side by side.
-
-    state, u and step lead with an axis over the plants.
-    """
-    arguments = jax.tree.map(np.asarray, (state, np.asarray(u, dtype=float), step))
-    with jax.enable_x64(True):
-        choice = choose_code(_predict_moments, (predictor, *arguments), differs_by_run=[False, True, True, True])
-        if choice.code is not None:
-            found: tuple[Moments | None, ...] = choice.results()
-            return found
-        # By XLA in blocks of one size, the last filled up with its last plant.
-        count = len(u)
-        blocks = [
-            to_numpy(_each_by_xla(predictor, *jax.tree.map(lambda a, rows=rows: a[rows], arguments)))
-            for begin in range(0, count, BLOCK)
-            for rows in (np.minimum(np.arange(begin, begin + BLOCK), count - 1),)
-        ]
-    return jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *blocks)  # type: ignore[no-any-return]
-
-
-def _predict_moments(predictor: MultistepPredictor, state: PyTree, u: jax.Array, step: jax.Array) -> PyTree:
-    """Return the moments of states, outputs and what arrives at each step ahead (steps, K, ...).
-
-    They start from a state at `step`, under inputs `u` (steps, inputs).
-    """
-
-    def predict_row(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
-        """Return the state a row ahead, and the moments there."""
-        return predictor.predict_step(state, *row)
-
-    rows = jnp.asarray(u), jnp.asarray(step) + jnp.arange(len(u))
-    _, moments = jax.lax.scan(predict_row, jax.tree.map(jnp.asarray, state), rows)
-    return moments
-
-
-def _predict_moments_of_each(predictor: MultistepPredictor, states: PyTree, u: jax.Array, steps: jax.Array) -> PyTree:
-    """Return the moments of each step ahead for several plants, whose states, inputs and steps have a leading axis."""
-    return jax.vmap(lambda *plant: _predict_moments(predictor, *plant))(states, u, steps)
-
-
-_by_xla, _each_by_xla = quickly_compiled(_predict_moments), quickly_compiled(_predict_moments_of_each)
 
 
 def find_output_claim(filter: AbstractFilter, predictor: MultistepPredictor) -> Claim:

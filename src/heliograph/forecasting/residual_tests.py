@@ -60,7 +60,8 @@ class Residuals:
     def doubts(self) -> list[str]:
         """List what speaks against the model, one line each.
 
-        A p-value does if it is below FALSE divided by the number of tests. FALSE: the probability of any wrong doubt.
+        A p-value does if it is below FALSE (0.01) divided by the number of tests (Bonferroni): if the model is right,
+        the probability of any doubt at all is then at most FALSE.
         """
         tests = {"correlated over time": self.ljung_box, "not normal": self.normality,
                  "of a variance that changes": self.variance}  # fmt: skip

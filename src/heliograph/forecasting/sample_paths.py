@@ -117,10 +117,9 @@ def draw_paths(
     # States and modes at the start, then states x and outputs y in all rows ahead, of which the horizons are kept.
     starts = _draw_initial_states(target, count, np.random.default_rng(seed))
     keys, step = jax.random.split(key, count), np.asarray(origin.step)
-    believer = target.predictor.filter
-    learned = None
-    if isinstance(believer, AdaptiveFilter):
-        learned = np.asarray(believer.noise_deviations(target.state, origin.step))
+    learned = None  # deviations of the sensor's noise where the filter learns them
+    if isinstance(adaptive := target.predictor.filter, AdaptiveFilter):
+        learned = np.asarray(adaptive.noise_deviations(target.state, origin.step))
     limits, switching = StateLimits(target.predictor.limits), _find_switching(target)
     x, y = _draw_paths_from_states(plant, sensor, starts, ahead.u, keys, step, switching, learned, limits)
     return Paths(
@@ -134,7 +133,12 @@ def draw_paths(
 
 
 class ModeSwitching(NamedTuple):
-    """How a path's mode moves: by the filter's chain, from the first step on if the chain has `moved` before."""
+    """How a path's mode moves: by the Markov chain of the filter's modes.
+
+    Args:
+        filter: the filter, which has the chain; each of its joint modes is one of plant, sensor and channel together.
+        moved: whether the filter has predicted before. If not, its modes are already those of the first step.
+    """
 
     filter: MultipleModelFilter
     moved: Bool[Array, ""]
@@ -142,20 +146,22 @@ class ModeSwitching(NamedTuple):
     def draw_next(self, key: jax.Array, mode: jax.Array, u: jax.Array, k: jax.Array, is_first: jax.Array) -> jax.Array:
         """Return the mode of step k, drawn by the chain from the mode of the previous step.
 
-        `self.moved`: True if the filter has predicted before. If not, its modes are already those of the first step,
-        where the mode stays as it is. `u`: inputs of the step.
+        Args:
+            key: of the random numbers.
+            mode: joint mode of the previous step.
+            u: inputs of the step (inputs,), on which the transition probabilities may depend.
+            k: number of the step.
+            is_first: whether it is the path's first step. The mode stays there if the filter has not predicted before.
         """
         plant, channel = at(self.filter.plant, k), at(self.filter.channel, k)
-        rows = transition_over(plant, u, jnp.asarray(channel.transition))
+        transition = transition_over(plant, u, jnp.asarray(channel.transition))  # row i: probabilities of the next mode
         stays = is_first & ~jnp.asarray(self.moved)
-        return jnp.where(stays, mode, jax.random.categorical(key, jnp.log(rows[mode])))
+        return jnp.where(stays, mode, jax.random.categorical(key, jnp.log(transition[mode])))
 
     def choose_models(self, plant: Any, sensor: Any, mode: jax.Array) -> tuple[Any, Any]:
-        """Return plant and sensor of one step as they are in a joint mode."""
-        plant_mode, sensor_mode = (
-            jnp.asarray(self.filter.plant_modes)[mode],
-            jnp.asarray(self.filter.sensor_modes)[mode],
-        )
+        """Return plant and sensor of one step as they are in a joint mode; a part without modes as it is."""
+        plant_mode = jnp.asarray(self.filter.plant_modes)[mode]
+        sensor_mode = jnp.asarray(self.filter.sensor_modes)[mode]
         if isinstance(plant, ModalPlant):
             plant = plant.given(plant_mode)
         if isinstance(sensor, ModalSensor):
@@ -179,10 +185,15 @@ def _find_switching(target: ForecastTarget) -> ModeSwitching | None:
 def _draw_initial_states(
     target: ForecastTarget, draws: int, generator: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return states (draws, n) and modes (draws,) drawn from the last estimate, a mixture of Gaussians.
+    """Return states (draws, n) and modes (draws,) drawn from the last estimate, a mixture of K Gaussians.
 
-    Each is drawn from a part that is drawn by its weight. The modes are 0 where the filter has none. `target` has the
-    filter (`predictor`) and its last state.
+    For each draw one Gaussian is drawn by its weight, and from it the mode and the state. The modes are 0 where the
+    filter has none.
+
+    Args:
+        target: the filter (`predictor`) and its last state.
+        draws: number of draws.
+        generator: of the random numbers.
 
     Raises:
         ValueError: a filter that claims no covariance, a state of which not all is known.
@@ -197,16 +208,16 @@ def _draw_initial_states(
     # A mode by its probability in the drawn part: the first whose cumulated probability is above a uniform number.
     modes: np.ndarray = np.zeros(draws, dtype=int)
     if isinstance(target.state, ModalBeliefs):
-        cumulated = np.cumsum(np.asarray(target.state.weight), axis=1)[part]
+        cumulated = np.cumsum(np.asarray(target.state.weight), axis=1)[part]  # weight: (K, modes)
         uniform = generator.random(draws)[:, None] * cumulated[:, -1:]  # weights of a part need not sum to 1
         modes = np.minimum((uniform > cumulated).sum(axis=1), cumulated.shape[1] - 1)
     # States with limits first, then the others given these: the part's mean, plus a root of its covariance times
     # standard normal numbers. Attitudes are turned.
-    center, covariances = draw_limited_components(part, means, covariances, target.predictor.limits, generator)
+    mean, covariances = draw_limited_components(part, means, covariances, target.predictor.limits, generator)
     values, vectors = np.linalg.eigh(covariances)
     roots = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
     changes = np.einsum("dij,dj->di", roots[part], generator.normal(size=(draws, means.shape[1])))
-    drawn: np.ndarray = Manifold((), filter.attitude).settle(center, center + changes)
+    drawn: np.ndarray = Manifold((), filter.attitude).settle(mean, mean + changes)
     return drawn, modes
 
 

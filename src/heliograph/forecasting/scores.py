@@ -27,18 +27,24 @@ class MixtureLaws(NamedTuple):
 
 
 def select_law(moments: Moments, number: int, horizon: int) -> MixtureLaws:
-    """Return the law of one number at one horizon (its index), from each row."""
+    """Return the forecast of one of m numbers at one horizon from each row, as a mixture of K Gaussians (rows, K).
+
+    Args:
+        moments: forecasts of all numbers from each row: weights (rows, horizons, K) and means (rows, horizons, K, m).
+            `covariances` holds only the variances, as `roll_forecasts` returns them: (rows, horizons, K, m). `laws`
+            has the laws of the single numbers where they are not this mixture, each part (rows, horizons, K, m).
+        number: index of the number.
+        horizon: index of the horizon.
+    """
     if moments.laws is not None:
         weights, means, variances = map(np.asarray, moments.laws)
-        of_number = (slice(None), horizon, slice(None), number)
-        return MixtureLaws(weights[of_number], means[of_number], variances[of_number])
-    weights, means = np.asarray(moments.weights), np.asarray(moments.means)
-    variances = np.asarray(moments.covariances)  # the field holds variances here, in place of covariances
+        return MixtureLaws(*(part[:, horizon, :, number] for part in (weights, means, variances)))
+    weights, means, variances = map(np.asarray, (moments.weights, moments.means, moments.covariances))
     return MixtureLaws(weights[:, horizon], means[:, horizon, :, number], variances[:, horizon, :, number])
 
 
 def compute_probability_below(law: MixtureLaws, values: np.ndarray) -> np.ndarray:
-    """Return P(less than what came) of each row (rows,): uniform on (0, 1) where the laws are right.
+    """Return P(X < value) of each row (rows,), X being of the row's law: uniform on (0, 1) where the laws are right.
 
     Of a value that a part knows exactly (variance 0) it is P(less) + P(equal) / 2: 1/2 where that is what came.
     """
@@ -46,7 +52,7 @@ def compute_probability_below(law: MixtureLaws, values: np.ndarray) -> np.ndarra
 
 
 def _standardise(difference: np.ndarray, variance: np.ndarray) -> np.ndarray:
-    """Return the difference in deviations; where the variance is 0, none is 0 and any other is infinite."""
+    """Return difference / sqrt(variance); where the variance is 0, a difference of 0 is 0 and any other is infinite."""
     deviation = np.sqrt(variance)
     is_known = deviation == 0
     in_deviations = difference / np.where(is_known, 1.0, deviation)
@@ -58,7 +64,7 @@ def _standardise(difference: np.ndarray, variance: np.ndarray) -> np.ndarray:
 def is_known_and_came(law: MixtureLaws, values: np.ndarray) -> np.ndarray:
     """Return in which rows the law knows the value, but for rounding, and it came (rows,).
 
-    An interval about it holds all of what comes, however small the share that it claims.
+    Any interval about such a forecast holds what comes, whatever share it claims, so it tests no coverage.
     """
     rounding = ROUNDING * np.abs(law.mean)
     is_known = (np.sqrt(law.variances) <= rounding[:, None]).all(axis=1)
@@ -142,7 +148,9 @@ def average_overlapping(values: np.ndarray, horizon: int) -> ScoreMean:
     if n == 1 or not np.isfinite(mean):
         return ScoreMean(mean, float("nan"))
     lags = min(max(horizon - 1, int(BANDWIDTH * n**0.5)), len(values) - 1)
-    bartlett, overlap, one = _fall_over_lags(lags + 1), _fall_over_lags(horizon), came.astype(float)
+    # W and S as functions of the lag, and the vector of ones.
+    bartlett, overlap = _fall_over_lags(lags + 1), _fall_over_lags(horizon)
+    one = came.astype(float)
     # E[d' W d] = tr(M W M S) with M = I - 1 1' / n over the rows that are not NaN, which `one` marks by ones:
     # tr(W S) + (1' W 1) (1' S 1) / n^2 - 2 / n 1' W S 1.
     weights_of_rows, overlaps_of_rows = _weigh_neighbours(one, bartlett), _weigh_neighbours(one, overlap)
@@ -157,10 +165,15 @@ def average_overlapping(values: np.ndarray, horizon: int) -> ScoreMean:
 
 
 def average_coverage(is_inside: np.ndarray, horizon: int, level: float) -> ScoreMean:
-    """Return the mean of what is 1 inside an interval of probability `level`, 0 outside, and NaN where nothing came.
+    """Return the share of forecasts whose interval of probability `level` held what came, with its standard error.
 
-    Its standard error is at least that of an interval that holds what it claims: where all or none were inside, their
-    scatter would say 0.
+    The error is at least that of an interval that holds what it claims: where all or none were inside, their scatter
+    would say 0.
+
+    Args:
+        is_inside: of each row 1 if the value was inside, 0 if outside, NaN where nothing came (rows,).
+        horizon: rows ahead; forecasts from neighbouring rows overlap over so many.
+        level: probability that the interval claims.
     """
     share, error = average_overlapping(is_inside, horizon)
     came = (~np.isnan(is_inside)).astype(float)
@@ -176,6 +189,8 @@ def _fall_over_lags(count: int) -> np.ndarray:
 
 
 def _weigh_neighbours(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return at each row the sum of its neighbours' values (rows,), weighted by their distance: `weights[distance]`."""
-    kernel, reach = np.concatenate([weights[:0:-1], weights]), len(weights) - 1
-    return np.asarray(np.convolve(values, kernel)[reach : reach + len(values)])
+    """Return s_i = sum_j weights[|i - j|] values_j for each row i, over rows nearer than len(weights), itself too."""
+    reach = len(weights) - 1
+    symmetric = np.concatenate([weights[:0:-1], weights])  # weights of the distances -reach ... reach
+    # The full convolution begins `reach` rows before the first row.
+    return np.asarray(np.convolve(values, symmetric)[reach : reach + len(values)])

@@ -78,14 +78,15 @@ def _check_like_first(name: str, head: Origin, origin: Origin) -> None:
 
 
 def _stack_trees(trees: list[PyTree]) -> PyTree:
-    """Return trees of one structure as one whose leaves have a leading axis."""
+    """Return trees of arrays of one structure as one tree, whose arrays have a leading axis over the trees."""
     return jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *trees)
 
 
 def _stack_estimates(estimates: list[Estimate]) -> Estimate:
-    """Return estimates of single plants as one estimate of several, with the claim of the first that claims anything.
+    """Return estimates of single plants as one estimate of several, with a leading axis over the plants.
 
-    Covariances of estimates with another claim are NaN.
+    An estimate has one claim of its covariances ("exact", "upper", "nominal" or "none"): that of the first plant that
+    claims anything. Covariances of plants with another claim are NaN.
     """
     model = next((estimate for estimate in estimates if estimate.claim != "none"), estimates[0])
     unknown = np.full(np.shape(model.covariance), np.nan)
