@@ -21,8 +21,8 @@ def make_inference_data(solution: Solution, draws: int, seed: int) -> Any:
     """Return draws of the free numbers, and the log-likelihood of each row at each of them, as ArviZ keeps them.
 
     ArviZ compares and plots Bayesian fits. The draws are normal about the maximum likelihood estimate, with the inverse
-    curvature of the log-likelihood there as covariance (the Laplace approximation). They are drawn in coordinates on
-    unconstrained coordinates (such as logarithms of positive numbers).
+    curvature of the log-likelihood there as covariance (the Laplace approximation). They are drawn in unconstrained
+    coordinates (such as logarithms of positive numbers).
 
     Args:
         solution: the fit: its maximum `x` (p,), covariance and likelihood.

@@ -56,6 +56,7 @@ def round_to_width(value: float, width: float) -> str:
     """
     if not np.isfinite(value) or value == 0 or not np.isfinite(width) or width <= 0:
         return f"{value:.4g}"
+    # From the first digit of the value to the second digit of the width.
     digits = int(np.floor(np.log10(abs(value)))) - int(np.floor(np.log10(width))) + 2
     return f"{value:.{min(max(digits, 2), 8)}g}"
 

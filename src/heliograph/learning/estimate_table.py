@@ -43,11 +43,11 @@ ALONG = 1e-5  # share of a number's derivative that may lie along a ridge
 
 @dataclass(frozen=True, repr=False)
 class Solution:
-    """Maximum of the likelihood in one form.
+    """Maximum of the likelihood in one form ("linear" or "conditional"), with the table of estimates.
 
     Args:
-        surface: the likelihood.
-        top: where the search ended.
+        surface: the likelihood as a function of the free numbers.
+        top: where the search for its maximum ended.
         ridges: number of directions in which the likelihood does not change.
     """
 
@@ -101,19 +101,22 @@ class Solution:
 
     @cached_property
     def scores(self) -> Scores:
-        """Scores of each step, by recording, among active coordinates."""
+        """For each recording the score of each row, the gradient of its log-likelihood (steps, active coordinates)."""
         score = self.surface.evaluate_rows(self.top.x[None]).score[0][..., self.active]
         return [s[:steps] for s, steps in zip(score, self.surface.data.lengths, strict=True)]
 
     @cached_property
     def rank(self) -> InformationRank:
-        """Flat directions of active coordinates, along which l is constant: as many as `ridges`; and all others."""
+        """Directions of active coordinates in which the likelihood is constant, as many as `ridges`, and all others."""
         information = self.surface.evaluations(self.top.x[None]).late[0]  # of the second half of the rows
         return find_rank_of_late_rows(information[np.ix_(self.active, self.active)], self.ridges)
 
     @cached_property
     def hessian(self) -> Float[np.ndarray, "r r"]:
-        """Hessian of -l along the r identified directions (`basis`); the information if it is not positive definite."""
+        """Hessian of -l along the r identified directions, B' H B with B = `basis`.
+
+        If it is not positive definite, as by rounding, the Gauss-Newton information takes its place.
+        """
         hessian_of_active = self.surface.hessian(self.top.x, self.active)[np.ix_(self.active, self.active)]
         hessian = self._project_on_identified(hessian_of_active)
         least_eigenvalue = np.linalg.eigvalsh(hessian)[:1].sum()  # 0 if there is no direction
@@ -124,7 +127,10 @@ class Solution:
 
     @property
     def basis(self) -> Float[np.ndarray, "active r"]:
-        """Directions that the data identify, in columns of active coordinates (`rank.rest` has units `rank.unit`)."""
+        """Directions of the active coordinates that the data identify, in columns.
+
+        `rank.rest` has them in units of each coordinate's standard error, `rank.unit`.
+        """
         return np.asarray(self.rank.unit[:, None] * self.rank.rest)
 
     def _project_on_identified(self, matrix: np.ndarray) -> np.ndarray:
@@ -133,7 +139,10 @@ class Solution:
 
     @cached_property
     def in_few_stretches(self) -> Bool[np.ndarray, " active"]:
-        """Which active coordinates (active,) are real numbers whose information is in a few stretches of the data."""
+        """Which active coordinates (active,) are real numbers that only a few stretches of the data inform of.
+
+        The scores of such a number, as of a bias after a rare event, do not tell how far its estimate varies.
+        """
         free = np.flatnonzero(self.active & self.surface.domains.free)
         in_few_stretches = np.zeros(len(self.active), dtype=bool)
         if len(free) and not self.rank.flat.size:
@@ -147,7 +156,8 @@ class Solution:
         estimated by `method`. Numbers whose information is in a few stretches of the data (`in_few_stretches`) have the
         model's J.
         """
-        scores, by_model = self.scores, np.zeros((len(self.in_few_stretches), len(self.in_few_stretches)))
+        scores = self.scores
+        by_model = np.zeros((len(self.in_few_stretches), len(self.in_few_stretches)))  # the part of J by the model
         if self.in_few_stretches.any():
             # Here all directions are identified, so that the Hessian can be brought back to the active coordinates.
             inverse = np.linalg.inv(self.basis)
@@ -251,9 +261,8 @@ class Solution:
                 first = min(error, WIDE) * np.array([-2.0, 2.0])  # where the search for either end begins
                 low, high = self._find_profile_ends(coordinate, first, find_profile_drop(level))
                 return low, high
-            is_in_few_stretches = bool(
-                self.in_few_stretches[np.count_nonzero(self.active[:coordinate])]
-            )  # its place among active ones
+            index_among_active = np.count_nonzero(self.active[:coordinate])
+            is_in_few_stretches = bool(self.in_few_stretches[index_among_active])
         center = float(to_unconstrained(entry.domain, value))
         # Resampled blocks do not show how a number varies whose information is in a few stretches of the data.
         if method == "bootstrap" and not is_in_few_stretches:
@@ -263,7 +272,14 @@ class Solution:
         return center - half, center + half
 
     def _make_row(self, entry: TableEntry, value: float, error: float, ends: tuple[float, float]) -> Row:
-        """Return the row of an identified number, from its error and its interval in the unconstrained coordinate."""
+        """Return the row of an identified number.
+
+        Args:
+            entry: the number, with its name and domain.
+            value: its estimate.
+            error: standard error of its unconstrained coordinate (logarithm, logit or the number itself).
+            ends: ends of its interval in that coordinate.
+        """
         low, high = sorted(float(from_unconstrained(entry.domain, end)) for end in ends)
         slope = abs(float(slope_from_unconstrained(entry.domain, to_unconstrained(entry.domain, value))))
         return Row(

@@ -36,7 +36,7 @@ def describe_unfinished_climbs(
 
 
 def describe_boundaries(best: Solution) -> list[str]:
-    """Return a sentence on each number whose estimate is the end of its domain."""
+    """Return a sentence on each number whose estimate is the end of its domain, such as a variance of 0."""
     return [f"{row.name}: {row.value}, {row.interval} (95 %)." for row in best.rows() if row.boundary]
 
 

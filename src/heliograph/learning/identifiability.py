@@ -137,9 +137,10 @@ def identify_by_recording(surface: LikelihoodSurface, start: Float[np.ndarray, "
 
 
 def _draw_points_near(start: np.ndarray, seed: int) -> list[np.ndarray]:
-    """Return POINTS points (p,) drawn near a start (p,), at most AROUND away in each coordinate.
+    """Return POINTS (3) points (p,) drawn near a start (p,), at most AROUND (0.5) away in each coordinate.
 
-    Small coordinates are moved less.
+    At the start itself numbers may be identified by chance, or not be, as where two of them are equal. Small
+    coordinates are moved less.
     """
     rng = np.random.default_rng([seed, 1])
     reach = np.minimum(1.0, 0.2 + np.abs(start))
@@ -149,10 +150,15 @@ def _draw_points_near(start: np.ndarray, seed: int) -> list[np.ndarray]:
 def _judge_identifiability(
     parameters: Parameters, points: list[np.ndarray], ranks: list[InformationRank]
 ) -> Identifiability:
-    """Return what is identified, from the ranks of the information at several points (p,), with sentences on it.
+    """Return what is identified, from the ranks of the information at several points, with sentences on it.
 
-    `rank.flat`: directions, in columns, on which the data say nothing. `ridges`: their number at the point with fewest.
-    `rank.weakest`: the smallest information in any other direction; the largest over the points counts.
+    A point with more flat directions than another has them by chance, so the point with fewest counts.
+
+    Args:
+        parameters: the free numbers.
+        points: unconstrained coordinates of the points (p,).
+        ranks: at each point the flat directions (`flat`, in columns), on which the data say nothing, and the least
+            information in any other direction (`weakest`), of which the largest counts.
     """
     groups = tuple(find_confounded(parameters, points, ranks))
     ridges = min(rank.flat.shape[1] for rank in ranks)

@@ -30,9 +30,11 @@ HORIZON, RUNS = 500, 32  # steps and runs that are simulated under each law
 class SamplesToTell(NamedTuple):
     """Number of steps that the likelihood ratio needs to decide between two laws, and what it gains in each.
 
-    samples: steps after which both errors are at most `error`; infinite where the laws look alike. information: mean
-    of log p_true - log p_other per step where the first law is true, and where the second is, nats. deviation: of the
-    sum of these over n steps, over sqrt(n), for many steps.
+    Args:
+        samples: steps after which both errors are at most `error`; infinite where the laws look alike.
+        information: mean of log p_true - log p_other per step, in nats, where the first law is true and where the
+            second is.
+        deviation: standard deviation of the sum of these over n steps, over sqrt(n), for many steps.
     """
 
     samples: float
@@ -132,6 +134,7 @@ def _replace_law(channel: object, pair: tuple[AbstractLaw, AbstractLaw], law: Ab
     replaced = of_pair or like_first
 
     def replace_if_chosen(leaf: object) -> object:
+        """Return the new law in place of a gain in question, and anything else as it is."""
         return law if any(leaf is gain for gain in replaced) else leaf
 
     changed: AbstractRandomAffine = jax.tree.map(replace_if_chosen, single, is_leaf=_is_law)
@@ -156,8 +159,10 @@ def _predict_densities(
         u: inputs of the plant (steps, inputs).
         nodes: number of values that stand for the law.
     """
+    # The channel given that something arrives, since losses say nothing of the gains.
     received = channel.condition_on_arrival()
-    filter, parts = make_signal_filter(network.plant, node.sensor, received), ChannelDensities.of(received, nodes)
+    filter = make_signal_filter(network.plant, node.sensor, received)
+    parts = ChannelDensities.of(received, nodes)
     # Mean and covariance of the expected signal, and the measurement, with all steps of all runs in one axis.
     expected = filter.expect_signals(z, u)
     y, covariance, measured = (np.asarray(array).reshape(-1, *array.shape[2:]) for array in expected)

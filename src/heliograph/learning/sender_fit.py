@@ -211,7 +211,13 @@ def _search_from_starts(
 
 
 def make_event_filter(network: Network) -> AbstractFilter:
-    """Return the event filter of the network's only node; its likelihood is maximised in a fit."""
+    """Return the event filter of the network's only node; its likelihood is maximised in a fit.
+
+    An event filter also uses that nothing came: the sender then decided not to send, or the packet was lost.
+
+    Raises:
+        ValueError: a node without a trigger, whose sender sends in each step.
+    """
     (node,) = network.nodes.values()
     if not isinstance(node, Node) or node.trigger is None:
         raise fail("node to be learned", "one whose sender decides", type(node).__name__)
@@ -245,11 +251,13 @@ def _climb_simplex(
     climb: Any = minimize  # its types do not know an initial simplex
 
     def stop_above_enough(intermediate_result: Any) -> None:
+        """Stop the search once its best point is above `enough`: SciPy calls this after each step."""
         if -intermediate_result.fun > enough:
             raise StopIteration
 
     def negative_likelihood(x: Float[np.ndarray, " p"]) -> float:
-        return -at_start if np.array_equal(x, start) else -likelihood(x)  # at the start it is known already
+        """Return minus the log-likelihood, which is minimised; at the start it is known already."""
+        return -at_start if np.array_equal(x, start) else -likelihood(x)
 
     optimum = climb(negative_likelihood, start, method="Nelder-Mead", options=options, callback=stop_above_enough)
     return _BestPoint(np.asarray(optimum.x), -float(optimum.fun), converged=bool(optimum.success), stopped=False)
@@ -312,9 +320,12 @@ class _ProfilePoint(NamedTuple):
 
 
 class _Profile(NamedTuple):
-    """Profile of a coordinate: the log-likelihood, largest over all other coordinates, by its value.
+    """Profile of one coordinate of the free numbers: its value against the log-likelihood, largest over all others.
 
-    level: log-likelihood down to which a value belongs to the interval of the coordinate.
+    Args:
+        likelihood: log-likelihood at a point in unconstrained coordinates (p,).
+        coordinate: index of the coordinate.
+        level: log-likelihood down to which a value belongs to the interval of the coordinate.
     """
 
     likelihood: Likelihood
@@ -322,11 +333,12 @@ class _Profile(NamedTuple):
     level: float
 
     def find_distance_to_level(self, top: Float[np.ndarray, " p"], side: float) -> float:
-        """Return how far from the maximum `top` the profile falls to the level, to one side (-1.0 or 1.0).
+        """Return how far from the maximum `top` (p,) the profile falls to the level, to one side (-1.0 or 1.0).
 
-        Twice as far each time until the profile is below it, then by bisection.
+        The distance is doubled until the profile is below the level, or beyond FURTHEST, where an interval counts as
+        without an end; then it is found by bisection, to NEAR.
         """
-        inside, outside = 0.0, FIRST_REACH
+        inside, outside = 0.0, FIRST_REACH  # distances at which the profile is above and below the level
         nearby = _ProfilePoint(top[self.coordinate], np.delete(top, self.coordinate))
         while outside < FURTHEST:
             is_above, nearby = self.is_above_level(top[self.coordinate] + side * outside, nearby)
@@ -345,8 +357,12 @@ class _Profile(NamedTuple):
         """Return whether the profile at `value` is above the level, and its point there, searched from a nearby one.
 
         The profile is the log-likelihood with this coordinate held at `value`, maximised over the others. The search
-        stops as soon as it is above `self.level`. Its first simplex is as large as the two values are apart, up to
-        LARGEST_SIMPLEX. NEAR: accuracy in unconstrained coordinates.
+        stops as soon as it is above `self.level`, since only that is asked. Its first simplex is as large as the two
+        values are apart, up to LARGEST_SIMPLEX.
+
+        Args:
+            value: value of the coordinate.
+            nearby: another point of the profile, whose other coordinates begin the search.
         """
         size = float(np.clip(abs(value - nearby.value), 10 * NEAR, LARGEST_SIMPLEX))
         best = _climb_simplex(

@@ -16,13 +16,16 @@ LARGEST = 4  # exponent that is put in words
 
 
 class ConfoundedNumbers(NamedTuple):
-    """Free numbers of which the data identify fewer combinations than there are numbers.
+    """Free numbers v_i of which the data identify fewer combinations than there are numbers.
 
-    coordinates: coordinates of the numbers. exponents: rows e of identified products prod_i v_i^e_i; weights: rows w of
-    identified sums sum_i w_i v_i where no product is; what is identified besides is neither. fix: how many numbers have
-    to be known from elsewhere.
+    For instance the data may tell the product a b of two gains, but neither of them: exponents [[1, 1]], fix 1.
 
-    Shapes: exponents, weights (combinations, numbers).
+    Args:
+        coordinates: indices of the numbers' coordinates.
+        exponents: rows e of identified products prod_i v_i^e_i (combinations, numbers).
+        weights: rows w of identified sums sum_i w_i v_i, where no product is (combinations, numbers). What is
+            identified besides is neither product nor sum.
+        fix: how many of the numbers have to be known from elsewhere.
     """
 
     coordinates: tuple[int, ...]
@@ -32,11 +35,13 @@ class ConfoundedNumbers(NamedTuple):
 
 
 class InformationRank(NamedTuple):
-    """Rank of the information at a point: directions of which nothing is known, and those of which something is.
+    """Information I (p, p) at a point, split in directions along which it is 0, and those in which something is known.
 
-    flat, rest: orthonormal directions of either kind, in columns, in units of each coordinate. unit: that unit,
-    1 / sqrt(I_ii). weakest: the least eigenvalue along `rest`.
-    Shapes: flat (p, k), rest (p, p - k), unit (p,).
+    Args:
+        flat: orthonormal directions without information, in columns (p, k), in units of each coordinate.
+        rest: those with information, likewise (p, p - k).
+        unit: unit of each coordinate, 1 / sqrt(I_ii), its standard error if all others were known (p,).
+        weakest: least eigenvalue of I along `rest`, in these units.
     """
 
     flat: Float[np.ndarray, "p k"]
@@ -54,9 +59,9 @@ def find_information_rank(information: Float[np.ndarray, "p p"]) -> InformationR
     diagonal = np.diag(information)
     known = diagonal > 0
     unit = np.where(known, 1 / np.sqrt(np.where(known, diagonal, 1.0)), 1.0)
-    values, vectors = np.linalg.eigh(information * unit[:, None] * unit)
-    is_flat = values < NOTHING
-    weakest = float(values[~is_flat].min(initial=np.inf))
+    eigenvalues, vectors = np.linalg.eigh(information * unit[:, None] * unit)
+    is_flat = eigenvalues < NOTHING
+    weakest = float(eigenvalues[~is_flat].min(initial=np.inf))
     return InformationRank(flat=vectors[:, is_flat], rest=vectors[:, ~is_flat], unit=unit, weakest=weakest)
 
 
@@ -107,8 +112,9 @@ def _differentiate_coordinates(parameters: Parameters, x: Float[np.ndarray, " p"
 
 def _orthonormalise(vectors: np.ndarray) -> np.ndarray:
     """Return an orthonormal basis, in columns, of what the columns of `vectors` span."""
-    left, size, _ = np.linalg.svd(vectors, full_matrices=False)
-    return np.asarray(left[:, size > SPANNED * max(size.max(initial=0.0), 1e-300)])
+    left, singular_values, _ = np.linalg.svd(vectors, full_matrices=False)
+    least = SPANNED * max(singular_values.max(initial=0.0), 1e-300)  # smaller ones are rounding
+    return np.asarray(left[:, singular_values > least])
 
 
 def _group_connected_coordinates(bases: list[np.ndarray]) -> list[tuple[int, ...]]:
@@ -156,10 +162,14 @@ def _make_confounded_numbers(
 
 
 def _find_identified_combinations(bases: list[np.ndarray]) -> np.ndarray:
-    """Return the combinations, in rows of reduced row echelon form, that no flat direction of any point changes.
+    """Return the combinations sum_i c_i v_i that no flat direction of any point changes, as rows c.
 
-    `bases`: flat directions at each point, in columns; the combinations are orthogonal to all of these. A singular
-    value up to SAME counts as 0.
+    The rows are in reduced row echelon form, so that each combination has few numbers. Along flat directions the
+    likelihood does not change.
+
+    Args:
+        bases: flat directions of the numbers v at each point, in columns (numbers, directions). The combinations are
+            orthogonal to all of these; a singular value up to SAME counts as 0.
     """
     _, singular_values, right_vectors = np.linalg.svd(np.concatenate(bases, axis=1).T)
     rank = int(np.count_nonzero(singular_values > SAME))
@@ -224,9 +234,10 @@ def _format_power(name: str, exponent: float) -> str:
 
 
 def find_rank_of_late_rows(late: Float[np.ndarray, "p p"], ridges: int) -> InformationRank:
-    """Return the rank of the information `late` (p, p) of the second half of the rows, with `ridges` flat directions.
+    """Return the flat and other directions of the information `late` (p, p), with as many flat ones as `ridges`.
 
-    The initial state's law informs weakly on ridges, where no data do. The second half has hardly any of that.
+    `late` is the information of the second half of the rows. The law of the initial state, which the first half has,
+    informs weakly also on ridges, along which no data do. `ridges` was found at points where rounding matters less.
     """
     rank = find_information_rank(late)
     if rank.flat.shape[1] == ridges:

@@ -13,15 +13,22 @@ BENT = 0.5  # of the information between two such climbs, that the likelihood be
 ALIKE = 0.1  # of the gain between two such climbs, that their slopes may leave unexplained
 NEIGHBOURS = 1.0  # between logarithms or logits of two such climbs, whatever the information says
 
+# Log-likelihood l, its gradient and its Gauss-Newton information (near the Hessian of -l) at a point of each climb; and
+# the function that returns them at such points.
 Evaluated = tuple[Float[np.ndarray, " climbs"], Float[np.ndarray, "climbs p"], Float[np.ndarray, "climbs p p"]]
 Evaluate = Callable[[Float[np.ndarray, "climbs p"]], Evaluated]
 
 
 class OpenEnds(NamedTuple):
-    """Coordinates by which an end of a domain is at infinity.
+    """Which unconstrained coordinates have an end of their number's domain at infinity.
 
     A variance of 0 is at minus infinity of its logarithm, probabilities of 0 and 1 are at both ends of their logit.
-    Shapes: low, high, single (p,); single: numbers whose end can be tried alone.
+
+    Args:
+        low: coordinates with an end at minus infinity (p,).
+        high: coordinates with an end at infinity (p,).
+        single: coordinates of a number of their own on an interval, whose end can be tried alone (p,); not those of a
+            covariance or of probabilities that sum to 1.
     """
 
     low: Bool[np.ndarray, " p"]
@@ -41,10 +48,15 @@ class OpenEnds(NamedTuple):
 
 
 class ClimbEnds(NamedTuple):
-    """Ends of the searches, one a climb.
+    """Where some climbs (searches side by side) end.
 
-    x: the points. total: log-likelihood there; gradient: its derivatives. remaining: what a full step would still gain.
-    steps: number of steps that were taken. Shapes: x, gradient (climbs, p), total, converged, remaining (climbs,).
+    Args:
+        x: point of each climb (climbs, p).
+        total: log-likelihood there (climbs,).
+        gradient: its derivatives (climbs, p).
+        converged: whether the climb came to a maximum (climbs,).
+        remaining: what a full step would still gain, in nats (climbs,).
+        steps: number of steps that were taken.
     """
 
     x: Float[np.ndarray, "climbs p"]
@@ -56,16 +68,24 @@ class ClimbEnds(NamedTuple):
 
     @property
     def order(self) -> np.ndarray:
-        """Climbs from the highest likelihood to the lowest."""
+        """Numbers of the climbs from the highest log-likelihood to the lowest; NaN is last."""
         return np.argsort(-np.nan_to_num(self.total, nan=-np.inf), kind="stable")
 
 
 class Climbs(NamedTuple):
     """Climbs (searches side by side) between two steps.
 
-    x: points (climbs, p). total: log-likelihood l there (climbs,), gradient (climbs, p), information I (climbs, p, p).
-    model: B, a model of minus the Hessian of l (climbs, p, p). radius: of the trust region (climbs,). remaining: what a
-    full step would gain, g' I^-1 g / 2. done: climbs that go no further. joined: the climb that each joined, or itself.
+    Args:
+        x: point of each climb (climbs, p).
+        total: log-likelihood l there (climbs,).
+        gradient: g, its derivatives (climbs, p).
+        information: I, the Gauss-Newton information (climbs, p, p).
+        model: B, a model of minus the Hessian of l (climbs, p, p).
+        radius: of the trust region, in standard errors (climbs,).
+        remaining: what a full step would gain, g' I^-1 g / 2, in nats (climbs,).
+        done: climbs that go no further (climbs,).
+        converged: climbs that came to a maximum (climbs,).
+        joined: number of the climb to the same top that each climb joined, its own number if none (climbs,).
     """
 
     x: np.ndarray
@@ -80,7 +100,7 @@ class Climbs(NamedTuple):
     joined: np.ndarray
 
     def ends(self, steps: int) -> ClimbEnds:
-        """Return where the climbs (searches side by side) are after `steps` steps; `joined`: the climb each joined."""
+        """Return where the climbs are after `steps` steps; one that joined another is where that one is."""
         climb = self.joined
         for _ in range(len(climb)):  # a climb may join one that joins a third
             climb = climb[climb]

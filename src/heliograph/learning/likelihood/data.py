@@ -17,10 +17,14 @@ FEWEST = 10  # least count of numbers that arrived for each free number
 
 
 class LikelihoodData(NamedTuple):
-    """Recordings of one network, joined over its nodes and filled up with rows in which nothing arrived.
+    """Recordings of one network, joined over its nodes and filled up to one length, so that arrays hold them all.
 
-    Shapes: measurements (recordings, steps, received), inputs (recordings, steps, inputs), lengths (recordings,);
-    truth (recordings, steps, n), the true states where these are learned from, NaN where they are not known.
+    Args:
+        measurements: numbers that the nodes received, side by side (recordings, steps, received); NaN where one did not
+            arrive, and in the rows that fill up.
+        inputs: inputs of the plant (recordings, steps, inputs); rows that fill up repeat the last ones.
+        lengths: number of rows of each recording without those that fill up.
+        truth: true states where these are learned from, NaN where they are not known (recordings, steps, n); else None.
     """
 
     measurements: Float[np.ndarray, "recordings steps received"]

@@ -88,14 +88,14 @@ class MaximumSearch:
             starts: where to begin (starts, p); from a single one there is a single climb.
             seed: seed of the second round.
         """
-        no_ends = np.zeros(starts.shape[1])
-        climbed = self._climb_by_first_rows(starts, no_ends, 0)
+        no_ends = np.zeros(starts.shape[1])  # no coordinate is held at an end of its domain
+        climbed = self._climb_by_first_rows(starts, no_ends, own=0)
         top = self._prove_maximum(climbed)
         self.best, totals = top._replace(converged=False, reason=""), climbed.total  # totals: l at each climb's end
         if len(starts) > 1:
             around = self._draw_starts_around(top, len(starts) - 1, seed)
             # The top itself is the last start, so that climbs to it join it; it is no new result, hence [:-1].
-            climbed = self._climb_by_first_rows(np.concatenate([around, top.x[None]]), no_ends, len(around))
+            climbed = self._climb_by_first_rows(np.concatenate([around, top.x[None]]), no_ends, own=len(around))
             totals = np.concatenate([totals, climbed.total[:-1]])
             if climbed.total.max() > top.total + SAME:
                 top = self._prove_maximum(climbed)
@@ -215,10 +215,11 @@ class MaximumSearch:
         return _take_best_climb(self._climb(x[None], ends), ends)
 
     def _choose_restarts(self, top: HighestPoint) -> tuple[np.ndarray | None, str]:
-        """Return (points, reason): where to climb again if `top` is no maximum, or why it is none if no points help.
+        """Return the points (points, p) from which to climb again if `top` is no maximum, and why it is none.
 
-        A maximum gives (None, ""). SAME: nats that count as no rise. SADDLE: a curvature below it (negative) is that of
-        a saddle. NEAR: a gain of l promised by Newton's step that counts as none.
+        A maximum gives (None, ""). It is none if l rises by more than SAME on the way inside from an end of a domain,
+        or if the least curvature is below SADDLE (negative): both give points to climb from. It is also none if
+        Newton's step promises a gain of NEAR or more; no points help then, and the reason says so.
         """
         # For each number at an end of its domain: climb again if l rises on the way back inside.
         for index in np.flatnonzero(top.ends):

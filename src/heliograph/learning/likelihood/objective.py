@@ -63,10 +63,11 @@ Form = Literal["linear", "conditional", "truth"]
 
 @dataclass(frozen=True, eq=False)
 class Objective:
-    """Filter of one form, as a function of unconstrained numbers. Equal ones share a compiled program.
+    """What a fit maximises: the likelihood of the filter of one form, as a function of the free numbers.
 
-    A function may read numbers that live outside of it; a change of these shows in the network that it returns at the
-    start.
+    Equal objectives share a compiled program. They are compared by the code and closure of the function that builds the
+    network. It may also read numbers that live outside of it; a change of these shows in the network that it returns at
+    the start, which is compared too.
 
     Args:
         description: the network with its free numbers.
@@ -77,9 +78,11 @@ class Objective:
     form: Form
 
     def __eq__(self, other: object) -> bool:
+        """Return whether the other objective has the same likelihood; a program compiled for one then serves both."""
         return isinstance(other, Objective) and are_same(self._list_distinctions(), other._list_distinctions())
 
     def __hash__(self) -> int:
+        """Return the hash of parts in which equal objectives agree: code of the building function, and form."""
         return hash((_list_code_and_closure(self.description.build)[0], self.form))
 
     def _list_distinctions(self) -> tuple[object, ...]:
@@ -94,15 +97,15 @@ class Objective:
         )
 
     def filter(self, x: Array) -> AbstractFilter:
-        """Return the filter of this form at unconstrained coordinates x (p,)."""
+        """Return the filter of this form with the free numbers at unconstrained coordinates x (p,)."""
         return make_filter_of_form(self.description.at(self.description.parameters.values(x)), self.form)
 
     def compute_innovations(self, x: Array, z: Array, u: Array) -> tuple[jax.Array, jax.Array]:
-        """Return the innovations (steps, m), NaN where nothing arrived, and their covariances (steps, m, m).
+        """Return the filter's innovations (steps, m), NaN where nothing arrived, and their covariances (steps, m, m).
 
-        Of the filter at x (p,), with measurements z (steps, received) and inputs u (steps, inputs). Where the estimate
-        is no number the innovation is 0 and its covariance NaN, so that the likelihood is NaN there, and not that of a
-        row in which nothing arrived.
+        The filter has the free numbers at x (p,), and runs over measurements z (steps, received) and inputs u
+        (steps, inputs). Where the estimate is no number the innovation is 0 and its covariance NaN, so that the
+        likelihood is NaN there, and not that of a row in which nothing arrived.
         """
         filter = self.filter(x)
 
@@ -165,7 +168,11 @@ def make_objectives(network: Description, by_truth: bool = False) -> list[Object
 
 @lru_cache
 def _reuse_equal_objective(objective: Objective) -> Objective:
-    """Return the first objective that equals this one, so that its compiled program is found without a comparison."""
+    """Return the first objective that equals this one, from the cache; this one itself if it is the first.
+
+    Compiled programs are found by their objective. To compare two objectives that are not the same object takes long,
+    as it builds their networks. `lru_cache` does it here once, and from then on all use one object.
+    """
     return objective
 
 

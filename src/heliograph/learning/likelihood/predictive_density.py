@@ -162,9 +162,15 @@ def predictive(
 
 
 class StackPartDensity(NamedTuple):
-    """Part of a stack as arrays over the combinations of its gains and noises: z = gain y + offset + noise in each.
+    """Law of one part of a channel, a mixture: in each combination of values of its gains, z = G y + offset + noise.
 
-    Shapes: log_weight (a,), gain (a, m, p), offset (a, m), noise (a, m, m).
+    y (p,) is the sensor's signal and z (m,) what arrives of this part.
+
+    Args:
+        log_weight: log of the probability of each combination a (a,).
+        gain: G (a, m, p).
+        offset: (a, m).
+        noise: covariance of the noise (a, m, m).
     """
 
     log_weight: np.ndarray

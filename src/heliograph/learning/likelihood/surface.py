@@ -29,7 +29,13 @@ TINY = 1e-300
 
 
 class LeastCurvature(NamedTuple):
-    """Least eigenvalue of the Hessian of -l in standard errors, its direction (p,), and g' |H|^-1 g / 2."""
+    """How the log-likelihood l bends at a point, by the Hessian H of -l in units of standard errors.
+
+    Args:
+        least: least eigenvalue of H; negative at a saddle.
+        direction: its eigenvector in unconstrained coordinates (p,).
+        gain: what a Newton step would gain, g' |H|^-1 g / 2 with the gradient g of l, in nats.
+    """
 
     least: float
     direction: Float[np.ndarray, " p"]
@@ -99,23 +105,24 @@ class LikelihoodSurface:
         return evaluation.total, evaluation.gradient, evaluation.information
 
     def hessian(self, x: Float[np.ndarray, " p"], active: Bool[np.ndarray, " p"]) -> Float[np.ndarray, "p p"]:
-        """Return the Hessian of -l at x (p, p), by central differences of gradients.
+        """Return the Hessian of -l at x (p, p), by central differences of gradients: the observed information.
 
-        Rows and columns of coordinates that are not `active` (p,), or of which the data know nothing, are those of the
-        information.
+        Rows and columns of coordinates that are not `active` (p,), or of which the data say nothing, are those of the
+        Gauss-Newton information.
         """
         information: np.ndarray = self.evaluations(x[None]).information[0]
         # Each coordinate is moved by DIFFERENCE standard errors to either side.
         diagonal = np.diag(information)
-        is_told = diagonal > 0
-        width = np.where(is_told, DIFFERENCE / np.sqrt(np.where(is_told, diagonal, 1.0)), 0.0)
-        moving = np.flatnonzero(active & is_told)
+        has_information = diagonal > 0
+        width = np.where(has_information, DIFFERENCE / np.sqrt(np.where(has_information, diagonal, 1.0)), 0.0)
+        moving = np.flatnonzero(active & has_information)
         if not len(moving):
             return information
         shifts = np.zeros((len(moving), len(x)))
         shifts[np.arange(len(moving)), moving] = width[moving]
         gradient = self.evaluations(np.concatenate([x + shifts, x - shifts])).gradient
         forward, backward = gradient[: len(moving)], gradient[len(moving) :]
+        # Row i, column j: -(dl/dx_j at x + w_i - dl/dx_j at x - w_i) / (2 w_i).
         block = (-(forward - backward) / (2 * width[moving][:, None]))[:, moving]
         # Made symmetric, as rounding leaves it almost.
         hessian: np.ndarray = information.copy()
@@ -224,8 +231,9 @@ class LikelihoodSurface:
         """
         moving = np.repeat((active & (np.arange(len(x)) != coordinate))[None], len(first), axis=0)
         points = np.repeat(x[None], len(first), axis=0)  # where climbs of the other coordinates begin
-        side, target, distance = np.sign(first), np.sqrt(2 * drop), np.abs(first)
-        inside, outside = np.zeros(len(first)), np.full(len(first), np.inf)
+        side, distance = np.sign(first), np.abs(first)
+        target = np.sqrt(2 * drop)  # the fall f at an end
+        inside, outside = np.zeros(len(first)), np.full(len(first), np.inf)  # distances that bracket each end
         for _ in range(CUTS):
             # The profile at these distances: l with the other coordinates at their best.
             points[:, coordinate] = x[coordinate] + side * distance
@@ -256,8 +264,13 @@ def _choose_next_distances(
 ) -> np.ndarray:
     """Return the distances to look at next (ends,): Newton's if it lies inside the bracket, else the bracket's middle.
 
-    If `outside` is not known yet (infinite), the bracket ends at three times the last `distance`, and this end replaces
-    the middle. No distance is above `furthest`.
+    Args:
+        newton: distances that Newton's method proposes (ends,).
+        distance: distances just looked at (ends,).
+        inside: largest distances known to be nearer than the ends that are sought (ends,).
+        outside: smallest known to be further, infinite where none is known yet (ends,). Then the bracket ends at three
+            times `distance`, and this end is taken in place of the middle.
+        furthest: no distance is above it.
     """
     is_closed = np.isfinite(outside)
     bracket_end = np.minimum(np.where(is_closed, outside, 3 * distance), furthest)

@@ -1,7 +1,7 @@
 """Trust-region search for the maximum of a likelihood, bounded in standard errors, from several starts side by side.
 
-A climb is one of these searches. Coordinates are unconstrained: logarithms and
-logits, or plain real numbers, which are called free of a scale. A point is a vector of them (p,).
+A climb is one of these searches. Coordinates are unconstrained: logarithms and logits, or plain real numbers, which are
+called free. A point is a vector of them (p,).
 """
 
 from collections.abc import Callable
@@ -23,7 +23,7 @@ WIDER, NARROWER = 3.0, 0.25  # factors of the radius after a step that the model
 CLOSE = 1e-15  # g' H^-1 g: twice the log-likelihood that a full step gains, 3e-8 standard errors away
 NEAR = 1e-8  # the same where rounding lets nothing better be found: 1e-4 standard errors
 TAKEN = 1e-4  # share of the predicted gain that a step has to bring to be taken
-DEFINED = 1e-8  # r' p / |r| |p| below which it is rounding
+DEFINED = 1e-8  # |r' p| / (|r| |p|) below which r' p is rounding, in the update of the Hessian
 AT_LIMIT = 1e-6  # nats that remain to be gained on the way to the end of a domain
 SMALLEST_RADIUS = 1e-12
 INVISIBLE = 1e-6  # information of a logarithm or a logit of which the likelihood sees next to nothing
@@ -75,9 +75,16 @@ def maximise_from_starts(
 
 
 def _start_climbs(evaluate: Evaluate, start: np.ndarray, moving: np.ndarray, domains: OpenEnds, close: float) -> Climbs:
-    """Return the state of all climbs before the first step, at the points `start` (climbs, p).
+    """Return the state of all climbs before the first step.
 
-    A climb is done from the beginning where l, or a derivative in a coordinate that moves (`moving`), is not finite.
+    A climb is done from the beginning where l, or a derivative in a coordinate that moves, is not finite.
+
+    Args:
+        evaluate: log-likelihood l (climbs,), gradient (climbs, p) and information (climbs, p, p) at points (climbs, p).
+        start: points at which the climbs begin (climbs, p).
+        moving: coordinates that move (climbs, p).
+        domains: coordinates whose domains end at infinity.
+        close: a climb has arrived where g' I^-1 g of gradient g and information I is below this.
     """
     total, gradient, information = evaluate(start)
     state = Climbs(
@@ -108,8 +115,10 @@ def _is_finite(total: np.ndarray, gradient: np.ndarray, information: np.ndarray,
 def _mark_arrived(state: Climbs, moving: np.ndarray, domains: OpenEnds, close: float) -> Climbs:
     """Return the state with climbs marked as done that have arrived, or whose radius is below SMALLEST_RADIUS.
 
-    A climb has arrived if g' I^-1 g, twice what is left to gain, is below `close`. At so small a radius rounding hides
-    the gain; the climb then counts as converged if the gain is below NEAR.
+    A climb has arrived if g' I^-1 g, twice what a full step would still gain, is below `close`; it has then converged.
+    At so small a radius rounding hides the gain, and NEAR takes the place of `close`. `state`: gradient g and
+    information I of each climb. `moving` (climbs, p): coordinates that move; those at an end of their domain, by
+    `domains`, count no more.
     """
     counting = moving & ~find_coordinates_at_limits(state.x, state.gradient, domains)
     remaining = np.where(state.done, state.remaining, expected_gain(state.gradient, state.information, counting) / 2)
@@ -182,7 +191,7 @@ def _accept_or_reject_steps(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return which climbs accept their step, and the radius for the next one, (climbs,) each.
 
-    Lanes are searches side by side. A step is accepted where the log-likelihood l rises by a share of the gain that the
+    A step is accepted where the log-likelihood l rises by a share of the gain that the
     model predicted. Where that gain is below the rounding of l, the gradient decides: the step is accepted if the
     gradient fell, or if the step went to the edge of the region, as across a plateau; and l must not fall by more than
     rounding.
@@ -278,14 +287,15 @@ def _correct_by_secant(
     """
     y = np.where(is_finite[:, None], np.nan_to_num(state.gradient - gradient), 0.0)
     r = y - multiply_each(model, step)
-    # The likelihood hardly depends on a logarithm or logit with so little information: y is but rounding there.
-    diagonal = np.diagonal(state.information, axis1=1, axis2=2)
-    r = np.where(free | (diagonal > INVISIBLE), r, 0.0)
-    # r' p counts where it is more than rounding of |r| |p|, both in units of standard errors.
-    r_times_step = np.sum(r * step, axis=1)
-    unit, _ = find_errors_and_flat_directions(state.information, step != 0)
-    squared_r, squared_step = (r * unit) ** 2, (step / np.where(unit > 0, unit, 1.0)) ** 2
-    size = np.sqrt(np.sum(squared_r, axis=1) * np.sum(squared_step, axis=1))
-    is_defined = is_finite & (np.abs(r_times_step) > DEFINED * size)
-    update = r[:, :, None] * r[:, None, :] / np.where(is_defined, r_times_step, 1.0)[:, None, None]
+    # A logarithm or logit with information below INVISIBLE hardly changes the likelihood: there y is only rounding.
+    information_of_each = np.diagonal(state.information, axis1=1, axis2=2)
+    r = np.where(free | (information_of_each > INVISIBLE), r, 0.0)
+    # The update is defined where |r' p| > DEFINED |r| |p|; less is rounding. Sizes are in units of each coordinate's
+    # standard error u = 1 / sqrt(I_ii), so that units of the numbers do not matter: |r| of r u, and |p| of p / u.
+    r_times_p = np.sum(r * step, axis=1)
+    standard_error, _ = find_errors_and_flat_directions(state.information, moving=step != 0)
+    squared_r = np.sum((r * standard_error) ** 2, axis=1)
+    squared_p = np.sum((step / np.where(standard_error > 0, standard_error, 1.0)) ** 2, axis=1)
+    is_defined = is_finite & (np.abs(r_times_p) > DEFINED * np.sqrt(squared_r * squared_p))
+    update = r[:, :, None] * r[:, None, :] / np.where(is_defined, r_times_p, 1.0)[:, None, None]
     return model + np.where(is_defined[:, None, None], update, 0.0)

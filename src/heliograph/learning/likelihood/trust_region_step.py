@@ -16,7 +16,13 @@ LARGEST = 1e12  # curvature in units of standard errors: beyond this a model is 
 
 
 class TrustRegionStep(NamedTuple):
-    """Steps p of all climbs, their lengths |D p|, and the gains that the model predicts, g' p - p' B p / 2."""
+    """The next step of each climb.
+
+    Args:
+        step: p, the change of the point (climbs, p).
+        length: its length |D p| in the units of the trust region's radius, standard errors (climbs,).
+        predicted: gain of log-likelihood that the model predicts, g' p - p' B p / 2, in nats (climbs,).
+    """
 
     step: Float[np.ndarray, "climbs p"]
     length: Float[np.ndarray, " climbs"]
@@ -85,8 +91,14 @@ def _scale_model(model: np.ndarray, information: np.ndarray, unit: np.ndarray) -
 def _find_step_within(radius: np.ndarray, g: np.ndarray, b: np.ndarray, d: np.ndarray) -> np.ndarray:
     """Return p = (B + s D^2)^-1 g (climbs, p) with the least shift s >= 0 that keeps |D p| within 1.01 of the radius.
 
-    `radius` (climbs,), g (climbs, p), b: B (climbs, p, p), d: the diagonal of D (climbs, p). Newton's method for
-    1 / |D p| = 1 / radius, from the least s that makes the matrix positive.
+    The shift is found by Newton's method for 1 / |D p| = 1 / radius, which is nearly linear in s. It begins at the
+    least s that makes the matrix positive.
+
+    Args:
+        radius: of the trust region (climbs,).
+        g: gradient (climbs, p).
+        b: B, minus the Hessian or near it (climbs, p, p).
+        d: diagonal of D (climbs, p).
     """
     # D^-1 B D^-1 + s I is positive for s above minus the least eigenvalue.
     least = np.linalg.eigvalsh(b / d[:, :, None] / d[:, None, :])[:, 0]

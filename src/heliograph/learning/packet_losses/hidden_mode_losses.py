@@ -10,7 +10,7 @@ from heliograph.model.fading import gilbert_elliott
 from heliograph.random_affine.base import AbstractRandomAffine
 
 STEP = 1e-20  # of the complex step, whose error is its square
-UNKNOWN, START = 2, 3  # kinds of runs of packets, after arrived (0) and lost (1)
+UNKNOWN, START = 2, 3  # codes of a packet of unknown fate and of the start of a stretch, besides 0 arrived and 1 lost
 
 STARTS = (  # loss when good, loss when bad, fail, recover: bursts, long spells, two rates that hardly differ
     logits(0.02, 0.9, 0.05, 0.5),
@@ -53,7 +53,8 @@ class HiddenModeLosses(AbstractLossLaw):
         stretches = check_fates(fates)
         # A stretch cut where packets arrived (its ends are CHOSEN) counts as log P(fates) - log P(both ends arrive).
         chosen = [keep_ends_only(fate) for fate in stretches if fate[-1] == CHOSEN]
-        whole, ends = FateRuns.of([fill_ends(fate) for fate in stretches]), FateRuns.of(chosen) if chosen else None
+        whole = FateRuns.of([fill_ends(fate) for fate in stretches])
+        ends = FateRuns.of(chosen) if chosen else None
 
         def likelihood(x: np.ndarray) -> tuple[float, np.ndarray]:
             """Return log P(fates) - log P(ends arrive) at the logits x, and its gradient.
@@ -114,14 +115,19 @@ class FateRuns:
     def __init__(self, kind: np.ndarray, length: np.ndarray):
         """Store for each kind which runs have it, their distinct lengths, and which of these lengths each run has.
 
-        A run is a row of packets of one kind: a fate that they share, or a single START. `length`: its number of
-        packets.
+        A run is a row of packets of one kind: a fate that they share, or a single START. Runs of one kind and length
+        share a matrix power, which is computed once.
+
+        Args:
+            kind: of each run: 0 arrived, 1 lost, UNKNOWN, or START (runs,).
+            length: number of packets in each run (runs,).
         """
         self.kind = kind
-        masks = {int(fate): kind == fate for fate in np.unique(kind)}
-        self.runs_by_kind = {
-            fate: (mask, *np.unique(length[mask], return_inverse=True)) for fate, mask in masks.items()
-        }
+        self.runs_by_kind: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
+        for fate in np.unique(kind):
+            has_kind = kind == fate
+            distinct_lengths, length_of_run = np.unique(length[has_kind], return_inverse=True)
+            self.runs_by_kind[int(fate)] = has_kind, distinct_lengths, length_of_run
 
     @staticmethod
     def of(fates: Fates) -> "FateRuns":

@@ -16,7 +16,7 @@ from heliograph.numerics.check import fail, scalar
 from heliograph.numerics.module import readable
 from heliograph.random_affine.base import AbstractRandomAffine
 
-INDEPENDENT, HIDDEN, RUNNING = "independent", "hidden", "running"
+INDEPENDENT, HIDDEN, RUNNING = "independent", "hidden", "running"  # names of laws
 
 LONG = 4  # packets back that the longer of the two chains looks
 LEVEL = 0.01  # probability that independent losses are said to have memory
@@ -25,8 +25,10 @@ LEVEL = 0.01  # probability that independent losses are said to have memory
 class HeldOutScores(NamedTuple):
     """Scores of a law on packets that it was not fitted to.
 
-    log_likelihood: mean over packets, nats. gain: difference from that of independent losses; gain_error: its standard
-    error, which allows for correlation over time.
+    Args:
+        log_likelihood: mean of log P(fate | fates before) over these packets, in nats.
+        gain: how much larger it is than that of independent losses.
+        gain_error: standard error of the gain, which allows for correlation over time.
     """
 
     log_likelihood: float
@@ -167,7 +169,12 @@ def learn_losses(fates: object, held_out: float = 1 / 3) -> Losses:
 def _find_significant_laws(laws: dict[str, AbstractLossLaw], parts: Fates) -> set[str]:
     """Return the names of the laws that a likelihood ratio test prefers to independent losses.
 
-    All tests together have the level LEVEL.
+    Twice the gain of log-likelihood is chi-square if losses are independent, with a degree of freedom for each further
+    probability that a law has. All tests together have the level LEVEL (1 %).
+
+    Args:
+        laws: fitted laws by name.
+        parts: stretches of fates to which they were fitted.
     """
     level = LEVEL / (len(laws) - 1)  # shared by the tests of all laws but "independent"
     total = {name: float(np.nansum(law.log_likelihoods(parts))) for name, law in laws.items()}
@@ -183,7 +190,11 @@ def _find_significant_laws(laws: dict[str, AbstractLossLaw], parts: Fates) -> se
 def _choose_law(significant: set[str], held_out: dict[str, HeldOutScores]) -> str:
     """Return the name of the law with the largest held-out likelihood, among independent losses and significant laws.
 
-    Without scores it is HIDDEN if that law is significant, else INDEPENDENT.
+    Without scores it is that of hidden modes (HIDDEN) if it is significant, else INDEPENDENT.
+
+    Args:
+        significant: names of the laws that a test prefers to independent losses.
+        held_out: scores of the laws on packets that they were not fitted to, by name; empty if there are none.
     """
     if not held_out:
         return HIDDEN if HIDDEN in significant else INDEPENDENT
@@ -207,10 +218,15 @@ def _fit_laws(parts: Fates, intervals: bool) -> dict[str, AbstractLossLaw]:
 
 
 def _score_held_out(parts: Fates, known: np.ndarray, cut: int) -> dict[str, HeldOutScores]:
-    """Return the scores of the laws on later packets by name, when the laws are fitted to the first `cut` trials.
+    """Return the scores of the laws on later packets by name, when the laws are fitted to the earlier ones.
 
-    Each later packet is predicted from all packets before it. `parts`: stretches of fates. `known`: which packets are
-    trials, stretch after stretch.
+    Each later packet is predicted from all packets before it.
+
+    Args:
+        parts: stretches of fates: 0 arrived, 1 lost, NaN unknown.
+        known: which packets count, of all stretches one after the other: those with a known fate, except ends that were
+            chosen because they arrived.
+        cut: how many of the packets that count the laws are fitted to, the first ones.
     """
     is_held_out = known & (np.cumsum(known) > cut)
     # Hide later fates as unknown, so that the laws are fitted to the first `cut` trials.
@@ -226,7 +242,10 @@ def _score_held_out(parts: Fates, known: np.ndarray, cut: int) -> dict[str, Held
 
 
 def _compute_maximum_log_likelihood(counts: np.ndarray) -> float:
-    """Return the maximum of the log-likelihood of counts n_ab (past a, fate b): sum n_ab log(n_ab / n_a)."""
+    """Return the largest log-likelihood of counts n_ab, (pasts, fates), over all P(b | a): sum n_ab log(n_ab / n_a).
+
+    n_ab is how often fate b followed past a, and n_a = sum_b n_ab.
+    """
     rows = counts.sum(axis=1, keepdims=True)
     return float(np.sum(xlogy(counts, counts / np.where(rows > 0, rows, 1.0))))
 
@@ -300,12 +319,16 @@ def _predict_losses(lost: Packets, base: float, weight: float, step: float) -> t
     P(lost) = base + weight d, where d+ = (1 - step) d + step (lost - base) follows the fates, from d = 0 on. Its
     derivatives follow recursions of the same form, so all run as linear filters. `lost`: the fates, 1 for a loss.
     """
-    last_fate = np.concatenate([[0.0], lost - base])[:-1] if len(lost) else lost
-    keep = [1.0, step - 1.0]
-    d = scipy.signal.lfilter([step], keep, last_fate)
-    by_base = scipy.signal.lfilter([step], keep, np.concatenate([[0.0], -np.ones(len(lost))])[: len(lost)])
-    by_step = scipy.signal.lfilter([1.0], keep, np.concatenate([[0.0], (lost - base - d)])[: len(lost)])
-    return base + weight * d, np.stack([1 + weight * by_base, d, weight * by_step])
+    recursion = [1.0, step - 1.0]  # lfilter([b], recursion, x) is y_k = (1 - step) y_(k-1) + b x_k
+
+    def delay(x: Packets) -> Packets:
+        """Return x one packet later, from 0 on: a packet's probability depends on the fates before it."""
+        return np.concatenate([[0.0], x])[: len(x)]
+
+    d = scipy.signal.lfilter([step], recursion, delay(lost - base))
+    d_by_base = scipy.signal.lfilter([step], recursion, delay(-np.ones(len(lost))))
+    d_by_step = scipy.signal.lfilter([1.0], recursion, delay(lost - base - d))
+    return base + weight * d, np.stack([1 + weight * d_by_base, d, weight * d_by_step])
 
 
 def _sum_log_probabilities(
@@ -318,5 +341,6 @@ def _sum_log_probabilities(
     """
     p, slope = predictions
     p = np.clip(p, 1e-300, 1 - 1e-16)  # so that both logarithms are finite
-    logs, score = np.where(lost == 1, np.log(p), np.log1p(-p)), (lost - p) / (p * (1 - p))
-    return float(np.sum(logs[trials])), slope @ np.where(trials, score, 0.0)
+    log_probability = np.where(lost == 1, np.log(p), np.log1p(-p))
+    score = (lost - p) / (p * (1 - p))  # dl/dp of each packet
+    return float(np.sum(log_probability[trials])), slope @ np.where(trials, score, 0.0)

@@ -23,9 +23,14 @@ LogLikelihood = Callable[[np.ndarray], tuple[float, np.ndarray]]  # logits (p,) 
 def maximise_over_shares(
     function: LogLikelihood, starts: list[np.ndarray], precision: float = 1e-13
 ) -> tuple[np.ndarray, float]:
-    """Return the highest point of a function of logits (p,), within END, by climbs from several starts; and its value.
+    """Return the highest point of a function of logits (p,), and its value there, by searches from several starts.
 
-    precision: the relative change of the value at which a climb ends.
+    A logit is log(p / (1 - p)) of a share p. The search is bounded to logits between -END and END.
+
+    Args:
+        function: returns the value and the gradient at logits (p,).
+        starts: points at which searches begin, (p,) each.
+        precision: relative change of the value at which a search ends.
     """
 
     def negative(x: np.ndarray) -> tuple[float, np.ndarray]:
@@ -43,11 +48,17 @@ def maximise_over_shares(
 
 
 def estimate_shares(function: LogLikelihood, top: np.ndarray, value: float, intervals: bool) -> list[Share]:
-    """Return the shares at the maximum `top` (logits) of a log-likelihood, which is `value` there.
+    """Return the shares (probabilities) at the maximum of a log-likelihood, with 95 % intervals by its profile.
 
     The profile of a share is the log-likelihood with this share held, maximised over the others. Its interval ends
     where the profile has fallen by FALL (1.92, for 95 %). The ends are NaN unless `intervals` is True. A share at 0 or
-    at 1 is itself one end of its interval; the other end is where the profile has fallen by FALL_AT_END.
+    at 1 is itself one end of its interval; the other end is where the profile has fallen by FALL_AT_END (3.00).
+
+    Args:
+        function: log-likelihood of the logits of the shares, with its gradient.
+        top: the logits at its maximum (p,).
+        value: the log-likelihood there.
+        intervals: whether to compute the intervals.
     """
     if not intervals:
         return [Share(float(p), float("nan"), float("nan")) for p in expit(top)]
@@ -55,10 +66,16 @@ def estimate_shares(function: LogLikelihood, top: np.ndarray, value: float, inte
 
 
 def _find_profile_interval(function: LogLikelihood, top: np.ndarray, value: float, i: int) -> Share:
-    """Return share i at the maximum `top` (logits), with the interval where its profile has fallen by less than FALL.
+    """Return share i at the maximum of a log-likelihood, with its 95 % interval.
 
-    `value`: the log-likelihood at the maximum. If the share is 0 or 1, the interval has one end, with the fall
-    FALL_AT_END. END: the largest logit of the search.
+    The interval is where the profile of the share has fallen by less than FALL. A share at 0 or 1 is one end of its
+    interval; at the other end the profile has fallen by FALL_AT_END.
+
+    Args:
+        function: log-likelihood of the logits of all shares, with its gradient.
+        top: the logits at its maximum (p,).
+        value: the log-likelihood there.
+        i: index of the share.
     """
     # A logit near the bounds of the search means a share of 0 or 1, as far as the data tell.
     is_zero, is_one = top[i] < 4 - END, top[i] > END - 4
