@@ -67,8 +67,12 @@ def _refuse_overload(network: Network, encoders: Mapping[str, Words]) -> None:
 class _PlantAndSenders(NamedTuple):
     """Linear plant and its senders, each of which sends one output c_i x + v_i as a word of some bits.
 
-    transition, process: A and Q of the plant. rows: c_i of the sensors. information: [i, B] = j_i(B), what a word of B
-    bits says of c_i x, as the inverse of a noise variance, for B from 0 to MOST.
+    Args:
+        transition: A of the plant (n, n).
+        process: covariance Q of its noise (n, n).
+        rows: c_i of each sender's sensor (senders, n).
+        information: [i, B] = j_i(B), what a word of B bits says of c_i x, as the inverse of a noise variance, for B
+            from 0 to MOST (senders, MOST + 1).
     """
 
     transition: Float[np.ndarray, "n n"]
@@ -167,15 +171,23 @@ def _compute_word_information(variance: float, encoder_range: float, gain: float
 
 
 def _find_bit_gain(name: str, node: Node) -> float:
-    """Return the gain g = 1 - 2p of a node's link for one bit, where p is its error rate.
+    """Return g = 1 - 2p for a node's link, which flips each bit of a word with the constant probability p.
+
+    A word of value q, counted from the middle of its range, arrives with the mean g q: so g is the factor of the signal
+    in what arrives, by which `_compute_word_information` finds how much a word says.
+
+    Args:
+        name: name of the node, for messages.
+        node: the node; its channel carries words of bits.
 
     Raises:
         ValueError: an error rate that is not constant, or another channel.
     """
     link = node.channel
     if isinstance(link, Flips) and isinstance(link.error, Constant):
-        return float(link.gain.moment(1))
-    if isinstance(link, GainAndNoise):  # a selection, as an encoder demands
+        return float(link.gain.moment(1))  # E[1 - 2p], with p a constant
+    # Of this class a node with an encoder has only maps that hand on words as they are, such as `perfect()`.
+    if isinstance(link, GainAndNoise):
         return 1.0
     raise fail(f"channel of node {name!r} of a design of bits", "decode_and_forward with constant rates, or perfect()",
                type(link).__name__)  # fmt: skip
@@ -234,19 +246,20 @@ def _add_bits_greedily(senders: _PlantAndSenders, total: int) -> Float[np.ndarra
     bits = np.zeros(len(senders.rows), dtype=int)
     error = _compute_steady_error(senders, _information_of_bits(senders, bits))
     while (left := total - bits.sum()) > 0:
-        # (decrease of the error for each bit, sender, bits added, error then): the first counts most.
+        # The largest decrease of the error for each bit, with (sender, bits added, error then) to compare equal ones
+        # by.
         best = (0.0, 0, 0, error)
         for i in range(len(bits)):
             for more in range(1, min(left, MOST - bits[i]) + 1):
                 tried = bits.copy()
                 tried[i] += more
-                lower = _compute_steady_error(senders, _information_of_bits(senders, tried))
-                best = max(best, ((error - lower) / more, i, more, lower))
-        decrease, sender, more, lower = best
-        if decrease * more <= ROUNDING * error:
+                error_then = _compute_steady_error(senders, _information_of_bits(senders, tried))
+                best = max(best, ((error - error_then) / more, i, more, error_then))
+        decrease_per_bit, sender, more, error_then = best
+        if decrease_per_bit * more <= ROUNDING * error:
             return bits
         bits[sender] += more
-        error = lower
+        error = error_then
     return bits
 
 
@@ -286,10 +299,16 @@ def _find_envelope(values: Float[np.ndarray, " bits"]) -> list[tuple[int, float]
 def _spend_bits(hulls: list[list[tuple[int, float]]], worth: np.ndarray, total: int) -> Float[np.ndarray, " senders"]:
     """Return the information j_i (senders,) of real bits, `total` in sum, that maximises sum_i worth_i j_i.
 
-    The steepest edges of the envelopes come first. `hulls`: corners (bits, j) of each sender's concave envelope,
-    between which j is linear.
+    The steepest edges of the envelopes come first, weighted by worth: so each bit goes where it counts most.
+
+    Args:
+        hulls: corners (bits, j) of each sender's concave envelope of j over bits, between which j is linear.
+        worth: what a unit of each sender's information is worth (senders,).
+        total: sum of the bits.
     """
-    edges = [  # (worth of a bit, sender, bits, information)
+    # Edges between the corners (a bits, information low) and (b bits, information high) of each envelope, as (worth of
+    # a bit, sender, bits, information).
+    edges = [
         (worth[i] * (high - low) / (b - a), i, b - a, high - low)
         for i, hull in enumerate(hulls)
         for (a, low), (b, high) in pairwise(hull)

@@ -30,7 +30,7 @@ Advance = TypeAliasType("Advance", Callable[[str], None])
 
 
 def _report_nothing(what: str) -> None:
-    """Do nothing with a word on what comes next: progress is not reported."""
+    """Do nothing: the default for `advance`, by which progress is not reported."""
 
 
 @readable
@@ -138,9 +138,12 @@ def error_over_sites(
 
 @readable
 class ChangeWorth(NamedTuple):
-    """Worth of a change: the error (or the power, of a target error) of the design made again, and what that saves.
+    """Worth of a change of the network.
 
-    name: "one more a", "without a", "a relay halfway of a.hop1".
+    Args:
+        name: what changes: "one more a", "without a", "a relay halfway of a.hop1".
+        value: error of the design made again, or its power if an error is the target.
+        saved: how much less it is than before the change.
     """
 
     name: str
@@ -236,6 +239,7 @@ def _list_relays(
     hops = transmitter_names(node.channel)
     for i, hop in enumerate(hops):
         channel = _insert_relay(node.channel, hop, exponent)
+        # Hop i becomes the hops i and i + 1, and those behind it move on by one.
         now = [f"{name}.{each}" for each in transmitter_names(channel)]
         renamed: dict[str, tuple[str, ...]] = {f"{name}.{each}": (now[j + (j > i)],) for j, each in enumerate(hops)}
         renamed[f"{name}.{hop}"] = (now[i], now[i + 1])
@@ -262,6 +266,7 @@ def _change_nodes(
     """
 
     def rename(limit: PerTransmitter) -> PerTransmitter:
+        """Return a limit with the names that transmitters have in the changed network; a number for all as it is."""
         if not isinstance(limit, dict):
             return limit
         return {new: number for name, number in limit.items() for new in renamed.get(name, (name,))}

@@ -199,12 +199,12 @@ def _send_on_delta_rate(system: ScalarSystem, delta: float) -> float:
         raise fail("plant", "a stable one, which has a rate in the long run", f"a = {system.a:g}")
     # Change to the unit of the state, so that c is 1.
     delta, system = delta / abs(system.c), system._replace(c=1.0, r=system.r / system.c**2)
-    coarse_rate, coarse_cell = compute_rate_on_grid(system, delta, share=0.8)
-    fine_rate, fine_cell = compute_rate_on_grid(system, delta, share=0.5)
-    if fine_rate == coarse_rate:  # if nothing is ever sent, both grids say 0
-        return fine_rate
+    coarse = compute_rate_on_grid(system, delta, share=0.8)
+    fine = compute_rate_on_grid(system, delta, share=0.5)
+    if fine.rate == coarse.rate:  # if nothing is ever sent, both grids say 0
+        return fine.rate
     # Take off the error of the rectangle rule at the cut at delta, which is a multiple of the cell's size squared.
-    return float(fine_rate + (fine_rate - coarse_rate) * fine_cell**2 / (coarse_cell**2 - fine_cell**2))
+    return float(fine.rate + (fine.rate - coarse.rate) * fine.cell**2 / (coarse.cell**2 - fine.cell**2))
 
 
 def delta_for_rate(plant: AnyPlant, sensor: AnySensor, rate: float) -> float:
@@ -225,7 +225,14 @@ def delta_for_rate(plant: AnyPlant, sensor: AnySensor, rate: float) -> float:
 def _find_threshold(
     rate: float, rate_at: Callable[[float], float], system: ScalarSystem, accuracy: float = 1e-10
 ) -> float:
-    """Return the threshold delta at which the falling function `rate_at(delta)` has this rate."""
+    """Return the threshold delta at which the falling function `rate_at(delta)` has this rate.
+
+    Args:
+        rate: the rate of messages, between 0 and 1.
+        rate_at: the rate of messages by threshold.
+        system: plant and sensor, whose noises give a first guess.
+        accuracy: relative accuracy of the threshold.
+    """
     if not 0 < scalar("rate", rate) < 1:
         raise fail("rate", "a number between 0 and 1", rate)
     # The deviation of a measured value from one step to the next is a first guess of the threshold.
@@ -274,7 +281,7 @@ def _make_quadrature(edges: list[float], unit: float) -> tuple[np.ndarray, np.nd
     NODES nodes suffice on each interval, since the integrand changes over a unit or more.
     """
     intervals: list[tuple[float, float]] = []
-    for begin, end in pairwise(edges):
+    for begin, end in pairwise(edges):  # each part of the line
         count = int(np.ceil((end - begin) / (8 * unit)))
         intervals += pairwise(np.linspace(begin, end, count + 1))
     # Nodes and weights of the interval from -1 to 1, moved to each of these.

@@ -128,5 +128,5 @@ def _select_powers_of_node(name: str, powers: Mapping[str, Float[np.ndarray, "st
 
 
 def _join_steps_over_time(steps: Sequence[T]) -> T | OverTime:
-    """Return the single object of one step, which then holds for ever; of several steps an OverTime."""
+    """Return the objects of all steps as one `OverTime`; of a single step the object itself, which holds for ever."""
     return steps[0] if len(steps) == 1 else over_time(steps)

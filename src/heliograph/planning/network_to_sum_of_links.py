@@ -50,12 +50,14 @@ def find_links_of_sum(node: Node, second: Float[np.ndarray, "m1 m1"]) -> tuple[S
         amplified = amplify_transmitter(unit, hop, factor=None)
         assert isinstance(amplified, Superposed)
         unit = amplified
-    # Of each link E g, Var g, and the variance of its own noise; the noises add up with that of the receiver. The
-    # centre of second moments is Cov of (g, n) x (g, n): [0, 0, 0, 0] is Var g, [0, 0, -1, -1] is Var n.
+    # Of each link E g, Var g, and the variance of its own noise n; the noises add up with that of the receiver.
+    # spread[i, j, a, b] is the covariance of entries (i, a) and (j, b) of the matrix (g, n) of a link, of one row: the
+    # entry 0 of a row is g, and the last one n.
     moments = [second_order(link) for link in unit.maps]
+    spreads = [link.nominal.center for link in moments]
     mean = np.array([float(link.mean_gain[0, 0]) for link in moments])
-    variance = np.array([float(link.nominal.center[0, 0, 0, 0]) for link in moments])
-    floor = sum(float(link.nominal.center[0, 0, -1, -1]) for link in moments) + float(channel.noise.covariance[0, 0])
+    variance = np.array([float(spread[0, 0, 0, 0]) for spread in spreads])
+    floor = sum(float(spread[0, 0, -1, -1]) for spread in spreads) + float(channel.noise.covariance[0, 0])
     # The links' noise: D_ij = E[g_i] E[g_j] R_ij + (i = j) Var(g_i) t_i, with R the noise of the outputs that are sent
     # (`sensor_noise`) and t_i = E y_i^2 (`power`).
     outputs = [of_link[0] for of_link in channel.places]

@@ -71,10 +71,12 @@ def _read_limit(name: str, value: ArrayLike | Mapping[str, float] | None) -> Per
 
 
 class PowerLimits(NamedTuple):
-    """Polytope of the powers p >= 0 (time, free transmitter) that a budget allows.
+    """Limits of the powers p >= 0 (time, free transmitter) that a budget allows; infinite where nothing limits.
 
-    peak: of each entry; mean: of the mean over time of each column; total: of the mean over time of the sum. Infinite
-    where nothing limits.
+    Args:
+        peak: largest power of each transmitter at each step (time, free).
+        mean: largest mean over time of each transmitter's power (free,).
+        total: largest mean over time of the sum of all.
     """
 
     peak: Powers

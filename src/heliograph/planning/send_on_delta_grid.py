@@ -37,8 +37,21 @@ class ScalarSystem(NamedTuple):
         return float(prior * r / (prior + r))
 
 
+class RateOnGrid(NamedTuple):
+    """Share of steps in which a message is sent, computed on a grid of cells, and the length of a cell."""
+
+    rate: float
+    cell: float
+
+
 class _CellGrid(NamedTuple):
-    """Grid of cells: how many lie on either side of 0, how many reach from a cell to delta, and their length."""
+    """Grid of cells for a number, with a cell around 0.
+
+    Args:
+        each_side: number of further cells on either side of it.
+        of_delta: number of cells on either side of a cell that are no further than delta from it.
+        length: length of a cell.
+    """
 
     each_side: int
     of_delta: int
@@ -71,13 +84,18 @@ def _choose_cells(system: ScalarSystem, delta: float, share: float) -> _CellGrid
     return _CellGrid(each_side=cells_each_side, of_delta=cells_of_delta, length=h)
 
 
-def compute_rate_on_grid(system: ScalarSystem, delta: float, share: float) -> tuple[float, float]:
+def compute_rate_on_grid(system: ScalarSystem, delta: float, share: float) -> RateOnGrid:
     """Return the share of steps with a message of send-on-delta, by a grid of cells, and the cells' length.
 
     x+ = a x + w (variance q) is measured as z = x + v (variance r) and sent where |z - last sent| > delta. So
     (x, last sent) is a Markov chain. Its law is held as f[i, j] = P(x in cell i, last sent in cell j), on cells no
-    longer than `share` of the lesser noise's deviation. It is the same of (-x, -last sent), so that the rows of x >= 0
-    are all.
+    longer than `share` of the lesser noise's deviation. It is the same of (-x, -last sent), so that only the rows of
+    x >= 0 are computed.
+
+    Args:
+        system: plant and sensor, with c = 1.
+        delta: a value is sent if it is further than this from the last value sent.
+        share: largest length of a cell, as a share of the lesser noise's deviation.
     """
     a, q, r = system.a, system.q, system.r
     cells = _choose_cells(system, delta, share)
@@ -116,7 +134,7 @@ def compute_rate_on_grid(system: ScalarSystem, delta: float, share: float) -> tu
     f = np.real(vectors[:, 0] / vectors.sum()).reshape(-1, size)
     sent = _compute_law_after_message(move_law(f), noise, cells.of_delta)
     times = np.where(upper > 0, 2.0, 1.0)  # of each row, which is one of two but for that of x = 0
-    return float(times @ sent.sum(axis=1) / (times @ f.sum(axis=1))), cells.length
+    return RateOnGrid(rate=float(times @ sent.sum(axis=1) / (times @ f.sum(axis=1))), cell=cells.length)
 
 
 def _compute_law_after_message(f: np.ndarray, noise: np.ndarray, cells_of_delta: int) -> np.ndarray:

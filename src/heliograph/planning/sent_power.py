@@ -37,9 +37,11 @@ Moments = Float[np.ndarray, "batch steps m1 m1"]  # E (y, 1)(y, 1)'
 class SentPower(Module):
     """Power that each transmitter sends, in the units of the sensor's output squared.
 
-    over_time: mean square at each step by name, (steps,), one step if steady; standard_error of it, zero where it is
-    exact. growth: spectral radius squared of a linear plant, the factor by which power grows in the long run at each
-    step where it is above 1; NaN where the plant is not linear, or every sensor sends its innovation.
+    Args:
+        over_time: mean square at each step by name, (steps,), one step if steady.
+        standard_error: its standard error, likewise; zero where it is exact.
+        growth: spectral radius squared of a linear plant, the factor by which power grows in the long run at each step
+            where it is above 1; NaN where the plant is not linear, or every sensor sends its innovation.
     """
 
     over_time: dict[str, Float[np.ndarray, "steps"]]
@@ -63,9 +65,9 @@ class SentPower(Module):
 
     @property
     def words(self) -> str:
-        """Sentence on whether the power stays bounded.
+        """Sentence on whether the power stays bounded in the long run, from its `growth`.
 
-        `self.growth`: the factor of the power from step to step in the long run. It is NaN or 1 if it is not known.
+        A growth of NaN or 1 tells nothing of it.
         """
         if np.isnan(self.growth) or self.growth == 1:
             return "what is sent is known for these steps only"

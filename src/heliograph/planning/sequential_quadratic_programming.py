@@ -26,8 +26,22 @@ ROUNDING = 1e-14  # relative
 LEAST_SIZE = 1e-12  # unit of a value that is less, or 0, at the start
 
 
+class ValueAndSlope(NamedTuple):
+    """Value of a function of z at a point, and its gradient."""
+
+    value: float
+    slope: Vector
+
+
 class Evaluation(NamedTuple):
-    """Error and transmitted powers (all steps of all transmitters in one row) at a point, and their derivatives."""
+    """Error and transmitted powers of a design at a point x, and their derivatives.
+
+    Args:
+        error: the error.
+        error_slope: its gradient by x.
+        powers: powers of all transmitters at all steps, step after step (entries,).
+        power_slope: derivatives of the powers by x (entries, x).
+    """
 
     error: float
     error_slope: Vector
@@ -36,7 +50,14 @@ class Evaluation(NamedTuple):
 
 
 class PowerAndErrorLimits(NamedTuple):
-    """Limits rows @ powers <= most, with most 1 or 0, and error <= target if given; `steps` make the mean power."""
+    """Limits rows @ powers <= most, and error <= target if a target is given.
+
+    Args:
+        rows: a row for each limit, scaled so that the limit is 1, or 0 if nothing may be sent (limits, entries).
+        most: the limits, 1 or 0 (limits,).
+        target: target of the error; None if the error itself is minimised.
+        steps: number of steps, by which the sum of all powers is divided to the mean power.
+    """
 
     rows: Float[np.ndarray, "limits entries"]
     most: Float[np.ndarray, "limits"]
@@ -47,9 +68,14 @@ class PowerAndErrorLimits(NamedTuple):
 class DescentProblem(NamedTuple):
     """A design problem as a descent needs it.
 
-    low, high, unit: least and largest values of x, and its scale. sharpnesses: smoothings of the error, one after
-    another, the last the sharpest. evaluate: error, powers and derivatives at x with a smoothing; None where they grow
-    without limit. restore: x moved back into the limits, as far as rounding took it out of them.
+    Args:
+        low: least values of x.
+        high: largest values of x.
+        unit: scale of each number in x.
+        sharpnesses: smoothings of the error, one after another, the last the sharpest.
+        evaluate: function of x and a smoothing that returns error, powers and derivatives; None where they grow without
+            limit.
+        restore: function that moves x back into the limits, as far as rounding took it out of them.
     """
 
     low: Vector
@@ -58,6 +84,20 @@ class DescentProblem(NamedTuple):
     sharpnesses: Sequence[int | None]
     evaluate: Callable[[Vector, int | None], Evaluation | None]
     restore: Callable[[Vector], Vector]
+
+
+class NewtonStep(NamedTuple):
+    """Newton's step on a Lagrangian, value - multipliers' room.
+
+    Args:
+        step: change of z.
+        multipliers: multipliers of the active limits, in their order.
+        active: which limits are active: met with equality (limits,).
+    """
+
+    step: Vector
+    multipliers: Vector
+    active: Bool[np.ndarray, "limits"]
 
 
 class ScaledProgramme:
@@ -73,16 +113,22 @@ class ScaledProgramme:
     """
 
     def __init__(self, problem: DescentProblem, limits: PowerAndErrorLimits, sharpness: int | None, start: Vector):
-        """Prepare a descent from a start, in coordinates z = x / unit, with this smoothing of the error (`sharpness`).
+        """Prepare a descent from a start x, in coordinates z = x / unit.
 
-        `self.size`: the objective at the start. The objective is divided by it, so that it is about 1.
+        The objective is divided by `self.size`, its value at the start, so that it is about 1.
+
+        Args:
+            problem: the design problem.
+            limits: of powers, and of the error where there is a target.
+            sharpness: the smoothing of the error, None of a trace.
+            start: the start x.
         """
         self.problem, self.limits, self.sharpness = problem, limits, sharpness
         low, high = problem.low / problem.unit, problem.high / problem.unit
         self.bounds = Bounds(low, high)
-        self._last: tuple[bytes, Evaluation | None] = (b"", None)
+        self._last: tuple[bytes, Evaluation | None] = (b"", None)  # the last point, as bytes, and its evaluation
         self.size = 1.0
-        value = self.objective(start / problem.unit)[0]
+        value = self.objective(start / problem.unit).value
         self.size = max(value, LEAST_SIZE) if np.isfinite(value) else 1.0
 
     def evaluate_at(self, z: Vector) -> Evaluation | None:
@@ -93,19 +139,22 @@ class ScaledProgramme:
             self._last = point, evaluation
         return evaluation
 
-    def objective(self, z: Vector) -> tuple[float, Vector]:
-        """Return the objective at z = x / unit over `self.size`, infinite without an evaluation, and its derivative.
+    def objective(self, z: Vector) -> ValueAndSlope:
+        """Return the objective at z = x / unit over `self.size`, infinite without an evaluation, and its gradient.
 
         The objective is the error, or the total mean power if there is a target error. Powers are summed over all
         steps, so their sum is divided by the number of steps.
         """
         evaluation = self.evaluate_at(z)
         if evaluation is None:
-            return np.inf, np.zeros_like(z)
+            return ValueAndSlope(np.inf, np.zeros_like(z))
+        # By z = x / unit the gradient is that by x times the unit.
+        unit = self.problem.unit
         if self.limits.target is None:
-            return evaluation.error / self.size, evaluation.error_slope * self.problem.unit / self.size
+            return ValueAndSlope(evaluation.error / self.size, evaluation.error_slope * unit / self.size)
         scale = self.limits.steps * self.size
-        return float(evaluation.powers.sum()) / scale, evaluation.power_slope.sum(axis=0) * self.problem.unit / scale
+        total, total_slope = float(evaluation.powers.sum()), evaluation.power_slope.sum(axis=0)
+        return ValueAndSlope(total / scale, total_slope * unit / scale)
 
     def limit_room(self, z: Vector) -> Float[np.ndarray, "limits"]:
         """Return the unused part of each limit at z, with the target error last; it is negative if a limit is exceeded.
@@ -130,12 +179,12 @@ class ScaledProgramme:
         return slope if target is None else np.vstack([slope, -evaluation.error_slope * self.problem.unit / target])
 
     def is_feasible(self, z: Vector) -> bool:
-        """Return whether the point exists and meets the limits, to FEASIBLE."""
+        """Return whether the error is finite at z and the limits are met, to a relative excess of FEASIBLE (1e-7)."""
         return self.evaluate_at(z) is not None and bool(np.all(self.limit_room(z) >= -FEASIBLE))
 
     def merit(self, z: Vector) -> float:
-        """Return the value of a feasible point, else infinite."""
-        return self.objective(z)[0] if self.is_feasible(z) else np.inf
+        """Return the objective at a point within the limits, and infinity beyond them, to compare points."""
+        return self.objective(z).value if self.is_feasible(z) else np.inf
 
     def descend(self, z: Vector, tolerance: float) -> Vector:
         """Return the point where sequential quadratic programming ends, or the start if that is better."""
@@ -151,21 +200,27 @@ class ScaledProgramme:
             return self._minimize(self.objective, within_limits, constraints, tolerance)
         return end if self.merit(end) < merit_at_start else z
 
-    def _compute_squared_excess(self, z: Vector) -> tuple[float, Vector]:
-        """Return the squared excess over the limits, and its derivative by z: what a way back into them minimises."""
-        broken = np.minimum(self.limit_room(z), 0.0)
-        return float(broken @ broken), 2 * broken @ self.limit_room_slope(z)
+    def _compute_squared_excess(self, z: Vector) -> ValueAndSlope:
+        """Return the sum of squared excesses over the limits, and its gradient: what a way back into them minimises."""
+        broken = np.minimum(self.limit_room(z), 0.0)  # minus the excess over each limit, 0 where it is met
+        return ValueAndSlope(float(broken @ broken), 2 * broken @ self.limit_room_slope(z))
 
     def _minimize(
         self,
-        function: Callable[[Vector], tuple[float, Vector]],
+        function: Callable[[Vector], ValueAndSlope],
         z: Vector,
         constraints: list[NonlinearConstraint],
         tolerance: float,
     ) -> Vector:
         """Return the end of SLSQP's minimisation of a function from z, within bounds and constraints.
 
-        `function`: z -> value and gradient. The end is moved to where the limits hold; it is z if it is not finite.
+        The end is moved back into limits that rounding broke (`restore`). If it is not finite, z is returned.
+
+        Args:
+            function: z -> value and gradient.
+            z: the start.
+            constraints: functions of z that have to be at least 0.
+            tolerance: relative change of the value at which the minimisation ends.
         """
         optimum = minimize(function, z, jac=True, method="SLSQP", bounds=self.bounds, constraints=constraints,
                           options={"ftol": tolerance, "maxiter": ITERATIONS})  # fmt: skip
@@ -187,24 +242,26 @@ class ScaledProgramme:
             newton = self._solve_newton_step(z)
             if newton is None:
                 break
-            step, multipliers, active = newton
-            if np.all(np.abs(step) <= ROUNDING):
+            if np.all(np.abs(newton.step) <= ROUNDING):
                 break
             unit = self.problem.unit
-            end = self.problem.restore(np.clip(z + step, self.bounds.lb, self.bounds.ub) * unit) / unit
-            value, value_at_end = (self._compute_penalised_value(point, multipliers, active) for point in (z, end))
+            end = self.problem.restore(np.clip(z + newton.step, self.bounds.lb, self.bounds.ub) * unit) / unit
+            value, value_at_end = (self._compute_penalised_value(point, newton) for point in (z, end))
             if not (self.is_feasible(end) and value_at_end <= value * (1 + ROUNDING)):
                 break
             z = end
         return z
 
-    def _compute_penalised_value(self, z: Vector, multipliers: Vector, active: Bool[np.ndarray, "limits"]) -> float:
-        """Return the value plus the excess over the active limits, weighed by their multipliers."""
-        excess = np.maximum(-self.limit_room(z), 0.0)
-        return float(self.objective(z)[0] + np.maximum(multipliers, 0.0) @ excess[active])
+    def _compute_penalised_value(self, z: Vector, newton: NewtonStep) -> float:
+        """Return the objective at z plus the excess over the active limits, weighed by their multipliers.
 
-    def _solve_newton_step(self, z: Vector) -> tuple[Vector, Vector, Bool[np.ndarray, "limits"]] | None:
-        """Return the step d from z, the multipliers m of the active limits, and which limits are active.
+        `newton`: says which limits are active, and has their multipliers.
+        """
+        excess = np.maximum(-self.limit_room(z), 0.0)
+        return float(self.objective(z).value + np.maximum(newton.multipliers, 0.0) @ excess[newton.active])
+
+    def _solve_newton_step(self, z: Vector) -> NewtonStep | None:
+        """Return Newton's step d from z on the Lagrangian, with the multipliers m of the active limits.
 
         The value is minimised with room(z) >= 0 for each limit; a limit is active where its room is about 0. Over the
         variables at no bound d solves H d - A' m = -g and A d = -room, with the gradient g of the value, the slopes A
@@ -219,10 +276,11 @@ class ScaledProgramme:
         # A and g, by each variable over its own size.
         scale = np.where(z[index] != 0, np.abs(z[index]), 1.0)
         slopes = self.limit_room_slope(z)[active][:, index] * scale
-        gradient = self.objective(z)[1][index] * scale
-        # The multipliers with which A' m comes nearest to the gradient, and the Hessian of the Lagrangian with these.
-        multipliers = np.linalg.lstsq(slopes.T, gradient, rcond=None)[0]
-        hessian = self._differentiate_lagrangian(z, multipliers, active, index, scale)
+        gradient = self.objective(z).slope[index] * scale
+        # First multipliers, with which A' m comes nearest to the gradient, for the Hessian of the Lagrangian. The step
+        # is solved for together with new multipliers, which are returned.
+        first_multipliers = np.linalg.lstsq(slopes.T, gradient, rcond=None)[0]
+        hessian = self._differentiate_lagrangian(z, first_multipliers, active, index, scale)
         # The equations of Karush, Kuhn and Tucker on the active limits, with H made symmetric.
         system = np.block([[(hessian + hessian.T) / 2, -slopes.T], [slopes, np.zeros((len(slopes), len(slopes)))]])
         right = np.concatenate([-gradient, -room[active]])
@@ -232,7 +290,7 @@ class ScaledProgramme:
         solution = np.linalg.lstsq(system, right, rcond=ROUNDING)[0]
         step = np.zeros_like(z)
         step[index] = scale * solution[: len(index)]
-        return step, solution[len(index) :], active
+        return NewtonStep(step=step, multipliers=solution[len(index) :], active=active)
 
     def _differentiate_lagrangian(
         self, z: Vector, multipliers: Vector, active: Bool[np.ndarray, "limits"], index: np.ndarray, scale: Vector
@@ -255,7 +313,7 @@ class ScaledProgramme:
 
             m are the `multipliers` of the `active` limits.
             """
-            gradient, slopes = self.objective(point)[1], self.limit_room_slope(point)[active]
+            gradient, slopes = self.objective(point).slope, self.limit_room_slope(point)[active]
             return np.asarray((gradient - multipliers @ slopes)[index] * scale)
 
         at_z, hessian = lagrangian_gradient(z), np.empty((len(index), len(index)))
@@ -267,7 +325,15 @@ class ScaledProgramme:
 
 
 def search_from_starts(problem: DescentProblem, limits: PowerAndErrorLimits, starts: Sequence[Vector]) -> Vector | None:
-    """Return the best end x of descents from these points x, refined and polished; None where none meets the limits."""
+    """Return the best end x of descents from several starts, or None if none of them meets the limits.
+
+    Coarse descents go from all starts. From the best end a fine one goes on, and Newton's method makes it exact.
+
+    Args:
+        problem: the design problem.
+        limits: of powers, and of the error where there is a target.
+        starts: points x, in the problem's own units.
+    """
     points, sharpest = [start / problem.unit for start in starts], problem.sharpnesses[-1]
     # Coarse descents from everywhere, the largest eigenvalue sharper and sharper.
     for sharpness in problem.sharpnesses if len(points) > 1 else problem.sharpnesses[:-1]:

@@ -24,7 +24,15 @@ HALVINGS = 200  # of an interval that holds a multiplier or a power
 
 
 class SummedLinks(NamedTuple):
-    """Links of a sum: rows B, noise D, power t of a unit amplitude, noise N, and the amplitudes at present."""
+    """Links of a sum z = sum_i a_i g_i y_i + noise, with amplitudes a_i, random gains g_i and sensor outputs y_i.
+
+    Args:
+        rows: B, with the row E[g_i] c_i for link i: what it carries of the state (links, n).
+        noise: D, covariance of what the links add to the sum before the receiver, at amplitudes 1 (links, links).
+        unit: t, the power E y_i^2 that each link sends at amplitude 1 (links,).
+        floor: N, variance of the noise of receiver and links that does not depend on the amplitudes.
+        present: amplitudes at present (links,).
+    """
 
     rows: Float[np.ndarray, "links n"]
     noise: Float[np.ndarray, "links links"]
@@ -140,6 +148,7 @@ def _cap_amplitudes(b: Vector, noise: Vector, floor: float, caps: Vector) -> Vec
     ratio = np.divide(b, noise, out=np.full_like(b, np.inf), where=noise > 0)
 
     def amplitudes_at(theta: float) -> Vector:
+        """Return the amplitudes min(theta b_i / D_i, cap_i); 0 of a link without gain."""
         return np.asarray(np.where(b > 0, np.minimum(theta * ratio, caps), 0.0))
 
     def excess(theta: float) -> float:

@@ -45,9 +45,14 @@ class SumOfLinksTask(NamedTuple):
 
     An amplitude is the factor by which a link's transmitter multiplies what it measures.
 
-    links: rows, noises and amplitudes at present. limits: of the free links' powers. free: which links are. covariance:
-    J (n, n), the information of a step, -> steady error covariance; error: covariance -> the number to be small.
-    starts, seed: of searches.
+    Args:
+        links: what the links carry, their noises and their amplitudes at present.
+        limits: limits of the free links' powers.
+        free: which links are free (links,).
+        covariance: function of the information J of a step (n, n) that returns the steady error covariance (n, n).
+        error: function of the error covariance that returns the number to be small.
+        starts: number of starts of a search.
+        seed: of the starts that are drawn.
     """
 
     links: SummedLinks
@@ -89,12 +94,14 @@ class SumOfLinksTask(NamedTuple):
     def bound_error(self, total: float) -> float:
         """Return a lower bound of the error for all amplitudes with this total power of the free links.
 
-        It is the error with an information that none of them exceeds. `self.fixed`: power of the links that are not
-        free.
+        It is the error with an information that none of them exceeds. The links that are not free send the power
+        `self.fixed` besides.
         """
-        all_links = total + self.fixed
+        total_of_all_links = total + self.fixed
         states = self.links.rows.shape[1]
-        information = self.links.best_information(all_links) if all_links > 0 else np.zeros((states, states))
+        information = np.zeros((states, states))
+        if total_of_all_links > 0:
+            information = self.links.best_information(total_of_all_links)
         return self.error(self.covariance(information))
 
     def find_amplitudes_by_formula(self, total: float) -> Vector | None:
@@ -131,6 +138,7 @@ class SumOfLinksTask(NamedTuple):
             return amplitudes
 
         def error_at(x: Vector) -> float:
+            """Return the error with the amplitudes at x."""
             return self.compute_error(amplitudes_at(x))
 
         # Descend from `first`, if it is given, and from uniform draws in the box; keep the best end.

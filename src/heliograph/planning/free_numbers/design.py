@@ -24,9 +24,13 @@ from heliograph.planning.sequential_quadratic_programming import (
 class LagrangeConditions(NamedTuple):
     """Lagrange's conditions at a point: the value, what they leave of it, and a watt's worth.
 
-    residual: the part of the value by which a linear model still sees it fall within the limits, over a step of the
-    numbers' own size. worth: the error that one more watt takes away at each step of each transmitter, where its own
-    limits rise too; price: that of a watt more of the total, or of one transmitter where no total limits.
+    Args:
+        value: what is minimised, the error, or the mean power where an error is the target.
+        residual: the part of the value by which a linear model still sees it fall within the limits, over a step of the
+            numbers' own size; 0 at a minimum.
+        worth: the error that one more watt takes away at each step of each transmitter, where its own limits rise too
+            (time, hops).
+        price: that of a watt more of the total, or of one transmitter where no total limits.
     """
 
     value: float
@@ -164,7 +168,8 @@ def evaluate_lagrange_conditions(
         has_total: whether the last of the limits of powers is that of the total.
     """
     # The programme counts numbers in their units, z = x / unit, and values in that at x, `programme.size`.
-    programme, z = ScaledProgramme(problem, limits, problem.sharpnesses[-1], x), x / problem.unit
+    programme = ScaledProgramme(problem, limits, problem.sharpnesses[-1], x)
+    z = x / problem.unit
     value, gradient = programme.objective(z)
     # Normals of the limits that are reached: of powers (the target last) and of the ends of the numbers' ranges.
     reached = programme.limit_room(z) < ACTIVE

@@ -87,10 +87,10 @@ class FreeNumbers(NamedTuple):
         return by_name
 
     def draw_start(self, draws: np.random.Generator) -> Vector:
-        """Return a random start: between the ends of each number's range, or near its first start without both ends.
+        """Return a random start (numbers,) for a further descent.
 
-        `self.low`, `self.high`: the ends of the ranges, infinite if there is none. Without both ends a number is its
-        first start times a random factor.
+        A number whose range has two ends is drawn between them. Another one is its first start times a random factor,
+        cut to the end that it has.
         """
         has_two_ends = np.isfinite(self.low) & np.isfinite(self.high)
         between_ends = draws.uniform(np.where(has_two_ends, self.low, 0.0), np.where(has_two_ends, self.high, 1.0))
@@ -171,7 +171,7 @@ INSIDE = 1e-9  # of the way from an end to the start
 
 
 class ErrorAndPowerSlopes(NamedTuple):
-    """Derivatives of the error, and of what each transmitter sends at each step."""
+    """Derivatives by the free numbers x: of the error, and of what each transmitter sends at each step."""
 
     error: Float[np.ndarray, "x"]
     powers: Float[np.ndarray, "time hops x"]
@@ -200,6 +200,7 @@ class TracedNetwork:
         return are_same(mine, theirs)
 
     def __hash__(self) -> int:
+        """Return the hash of the arrays' shapes, in which equal networks agree."""
         return hash(self._list_array_shapes())
 
     def _list_array_shapes(self) -> tuple[object, ...]:
@@ -227,7 +228,11 @@ class TracedNetwork:
         return make_mode_system(network, self.error, young)
 
     def differentiate_by_numbers(self, x: Array, solution: ModeSolution) -> ErrorAndPowerSlopes:
-        """Return the derivatives of error and powers by the numbers x, with X, K and L of the solution held fixed."""
+        """Return the derivatives of error and powers by the free numbers x (numbers,).
+
+        The error's derivative is that of the Lagrangian with the solution's covariances X, gains K and adjoint L held
+        fixed. Derivatives by the system's arrays come first; JAX pulls all of them back to x at once.
+        """
         system, pull_back = jax.vjp(self.make_system, jnp.asarray(x))
         # Derivatives by the system's arrays, each in the form of a system: of the error, then of each single power.
         of_error, count = jax.grad(lagrangian)(system, solution), system.powers.size
@@ -265,7 +270,7 @@ class EvaluatedPoint(NamedTuple):
     @property
     def error(self) -> float:
         """Return the number that the search minimises: the error, or if it is an eigenvalue its smoothed form."""
-        return self.criterion.smooth(self.covariances)[0]
+        return self.criterion.smooth(self.covariances).value
 
     @property
     def powers(self) -> Float[np.ndarray, "time hops"]:

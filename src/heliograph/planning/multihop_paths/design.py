@@ -4,9 +4,7 @@ import numpy as np
 
 from heliograph.numerics.check import fail
 from heliograph.planning.design_problem import Certificate, DesignProblem, PowerDesign
-from heliograph.planning.multihop_paths.model import (
-    compute_path_information,
-)
+from heliograph.planning.multihop_paths.model import compute_path_information
 from heliograph.planning.multihop_paths.path_problem import PathProblem, PowerTask
 from heliograph.planning.multihop_paths.power_split_over_hops import SplitPaths
 from heliograph.planning.multihop_paths.water_filling import water_filling
@@ -32,7 +30,7 @@ def find_least_error_powers(task: PowerTask) -> tuple[Powers, Certificate]:
     assert powers is not None  # the starts are within the limits
     # The least value of the error's tangent at these powers within the limits. A convex error is nowhere below it.
     value, bound = problem.compute_exact_error(powers), problem.lower_bound(powers)
-    _, tangent_value, _ = problem.make_support(powers)
+    tangent_value = problem.make_support(powers).value
     stationarity = max(tangent_value - bound, 0.0) / value if value > 0 else 0.0  # 0: nothing is left to gain
     # An error that is not convex is bounded by the convex problem with concave envelopes of each path's information.
     if not task.convex:
@@ -90,7 +88,7 @@ def _find_least_powers(problem: PathProblem, starts: list[Powers], target: float
     Each start is raised until it reaches the target. `scale`: the size of powers, which sets the steps of the search.
     """
     no_power = np.zeros_like(starts[0])
-    if problem.criterion.smooth(problem.covariances(no_power))[0] <= target:
+    if problem.criterion.smooth(problem.covariances(no_power)).value <= target:
         return no_power
     raised_starts = [_raise_powers(problem, start, target) for start in starts]
     reaching_starts = [start for start in raised_starts if start is not None]
@@ -101,18 +99,22 @@ def _find_least_powers(problem: PathProblem, starts: list[Powers], target: float
 
 
 def _raise_powers(problem: PathProblem, start: Powers, target: float) -> Powers | None:
-    """Return the start times the least factor that reaches the target within peaks and means, or None if none does."""
+    """Return the start times the least factor with which the error reaches the target, or None if none does.
+
+    The powers are cut to their limits. The factor is found by bisection of its logarithm between the two FACTORS, 1e-12
+    and 1e12, as the error falls with the powers.
+    """
 
     def reaches(factor: float) -> bool:
         """Return whether the start's powers times this factor, cut to the limits, lead to the target error or less."""
         powers = problem.limits.clip_powers(start * factor)
-        return problem.criterion.smooth(problem.covariances(powers))[0] <= target
+        return problem.criterion.smooth(problem.covariances(powers)).value <= target
 
-    low, high = FACTORS  # the factor's logarithm is bisected between these
+    low, high = FACTORS
     if not reaches(high):
         return None
     for _ in range(BISECTIONS):
-        middle = np.sqrt(low * high)
+        middle = np.sqrt(low * high)  # halves the interval of logarithms
         low, high = (low, middle) if reaches(middle) else (middle, high)
     return problem.limits.clip_powers(start * high)
 
@@ -145,7 +147,7 @@ def design_paths(problem: DesignProblem, task: PowerTask, target: float | None, 
     of_all_hops[:, task.free] = powers
     # Derivatives (time, hop) by the powers of all hops, of those that are not free too.
     all_free = task.problem._replace(path=paths.path, information=lambda p: compute_path_information(paths, p))
-    _, _, gradient = all_free.sensitivity(of_all_hops)
+    gradient = all_free.sensitivity(of_all_hops).gradient
     return PowerDesign(
         problem=problem,
         powers=dict(zip(paths.names, of_all_hops.T, strict=True)),

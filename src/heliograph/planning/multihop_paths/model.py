@@ -33,7 +33,13 @@ Matrices = Float[np.ndarray, "time n n"]
 
 
 class PlantSteps(NamedTuple):
-    """A and Q of each step; `start` is the error covariance before the first, None where the steps repeat for ever."""
+    """Linear plant x+ = A x + w, Cov w = Q, at each step.
+
+    Args:
+        transition: A (time, n, n).
+        process: Q (time, n, n).
+        start: error covariance before the first step (n, n); None where the steps repeat for ever.
+    """
 
     transition: Matrices
     process: Matrices
@@ -121,10 +127,19 @@ ByHop = TypeAliasType("ByHop", Float[ArrayLike, "..."])  # (M, H); (M,) of one h
 
 @readable
 class Paths(NamedTuple):
-    """Linear plant measured over independent paths; every array has a leading time axis, a period or a horizon.
+    """Linear plant measured over independent paths, each of which carries y = c x + v over a chain of hops.
 
-    plants: A and Q of each step. rows: c of each path. second: s = E y^2; signal: t = s - Var v. path: number of the
-    path of each hop, in the order of the hops. kappa, alpha: of each hop. names: of the hops' transmitters.
+    Arrays have a leading axis of the steps of a period or a horizon.
+
+    Args:
+        plants: A and Q of each step.
+        rows: c of each path (time, path, n).
+        second: s = E y^2 of each path (time, path).
+        signal: t = s - Var v (time, path).
+        path: number of the path of each hop, in the order of the hops (hop,).
+        kappa: E g^2 / (E g)^2 of each hop's random gain g (time, hop).
+        alpha: noise variance over E g^2 of each hop (time, hop).
+        names: names of the hops' transmitters.
     """
 
     plants: PlantSteps
@@ -311,6 +326,6 @@ def compute_path_sensitivities(
         p: the error covariance P after each step.
         weights: the derivative of the cost by each step's P.
     """
-    ahead = compute_adjoint(paths.plants, compute_information_matrix(paths, information), p, weights)
-    projected = paths.rows @ p
-    return np.asarray(np.sum((projected @ ahead) * projected, axis=-1))
+    L = compute_adjoint(paths.plants, compute_information_matrix(paths, information), p, weights)
+    c_P = paths.rows @ p  # row i: c_i P (time, path, n)
+    return np.asarray(np.sum((c_P @ L) * c_P, axis=-1))

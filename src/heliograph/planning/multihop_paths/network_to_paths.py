@@ -31,8 +31,10 @@ UNCORRELATED = 1e-12  # relative: a covariance of noises that counts as none
 class HopChain(NamedTuple):
     """A chain of hops for one number: what it carries, and kappa and alpha of its hops.
 
-    row: the number is row @ (y, 1), with the sensor's outputs y. hops: {name: (kappa, alpha)} in the order of the
-    chain.
+    Args:
+        row: the number is row @ (y, 1), with the sensor's outputs y (m + 1,).
+        hops: {name: (kappa, alpha)} in the order of the chain, with kappa = E g^2 / (E g)^2 of a hop's gain g, and
+            alpha its noise variance over E g^2.
     """
 
     row: Float[np.ndarray, "m1"]
@@ -210,10 +212,17 @@ def _make_no_paths_error(got: str) -> ValueError:
 
 
 class _PathsOfStep(NamedTuple):
-    """Lists of one step, filled path by path.
+    """Lists of one step, filled path by path; a path carries y = c x + v over its hops.
 
-    Of each path its row c, second = s = E y^2 and signal = t = s - Var v; of each hop kappa, alpha, the power that it
-    sends at present, its name, and the number of its path.
+    Args:
+        rows: c of each path.
+        second: s = E y^2 of each path.
+        signal: t = s - Var v of each path.
+        kappa: of each hop.
+        alpha: of each hop.
+        powers: what each hop's transmitter sends at present.
+        names: name of each hop's transmitter.
+        path: number of each hop's path.
     """
 
     rows: list[np.ndarray]

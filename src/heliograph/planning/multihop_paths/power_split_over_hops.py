@@ -34,7 +34,13 @@ Hops = Float[np.ndarray, "time path hops"]
 
 
 class PowerSplit(NamedTuple):
-    """Powers of the hops of each path, information j of the path, and dj/dP."""
+    """Best split of each path's power P over its hops.
+
+    Args:
+        powers: power of each hop (time, path, hops).
+        information: j, what the path then carries (time, path).
+        slope: dj/dP (time, path).
+    """
 
     powers: Hops
     information: PathValues
@@ -42,10 +48,13 @@ class PowerSplit(NamedTuple):
 
 
 class SplitPaths(NamedTuple):
-    """Paths by the power P that their free hops send together.
+    """Paths by the power P that their free hops send together: j = 1 / (A prod_h (1 + alpha_h / p_h) - t), sum p_h = P.
 
-    full: A = s K over what hops of fixed power let pass; signal: t; alpha: of the free hops, zeros where a path has
-    fewer than another.
+    Args:
+        full: A = s K over what hops of fixed power let pass (time, path).
+        signal: t (time, path).
+        alpha: noise of each free hop in units of sent power, 0 where a path has fewer hops than another
+            (time, path, hops).
     """
 
     full: PathValues
@@ -179,7 +188,13 @@ def _split_at_multiplier(alpha: np.ndarray, log_l: np.ndarray) -> tuple[np.ndarr
 
 
 class Envelope(NamedTuple):
-    """Concave envelope of j(P) on [0, cap]: a ray of this slope up to the power where it touches, then j itself."""
+    """Concave envelope of the information j(P) of each path on [0, cap]: a ray from 0 up to a power, then j itself.
+
+    Args:
+        whole: the paths, with j as a function of their power P.
+        touch: power up to which the ray goes, where it touches j (time, path).
+        ray: slope of the ray (time, path).
+    """
 
     whole: SplitPaths
     touch: PathValues
