@@ -250,8 +250,12 @@ def _smooth_noises(
 def _compute_deviations(mean: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return means (steps, size) and their standard deviations, both NaN where the variance is only rounding.
 
-    `covariance`: (steps, size, size). A variance up to the share ROUNDING of the largest over the steps counts as
+    A variance up to the share ROUNDING of the largest over the steps counts as
     rounding.
+
+    Args:
+        mean: means of a noise given all data (steps, size).
+        covariance: how these means vary where the model is right (steps, size, size).
     """
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     largest = np.max(variance, axis=0, where=np.isfinite(variance), initial=0.0)
@@ -260,7 +264,12 @@ def _compute_deviations(mean: np.ndarray, covariance: np.ndarray) -> tuple[np.nd
 
 
 def _find_peaks(size: np.ndarray, is_candidate: np.ndarray) -> list[int]:
-    """Return, for each run of neighbouring candidate rows, the row with the largest size."""
+    """Return, for each run of neighbouring candidate rows, the row with the largest size.
+
+    Args:
+        size: largest residual of each row (rows,).
+        is_candidate: which rows have a residual that counts as a shock (rows,).
+    """
     rows = np.flatnonzero(is_candidate)
     if not len(rows):
         return []

@@ -101,6 +101,11 @@ class ForecastTarget(NamedTuple):
 def find_target(origin: Origin, node: str | None, filter: str | None) -> ForecastTarget:
     """Return the estimate of this node and filter; a None matches any, but only one estimate may match.
 
+    Args:
+        origin: where the data end, with the estimates there.
+        node: name of the node, or None.
+        filter: name of the filter, or None.
+
     Raises:
         ValueError: no estimate matches, or several do.
     """
@@ -181,6 +186,10 @@ def _predict_without_nodes(network: Network, estimate: Estimate) -> tuple[Abstra
     A fusion rule combines estimates and has no state of its own, so its forecast is the plant's motion from there. The
     filter has the claim of the estimate, lowered to "nominal" if the prediction is approximate: if the plant is not
     linear or has angles.
+
+    Args:
+        network: the network, for its plant.
+        estimate: the fused estimate where the data end.
     """
     plant = first(network.plant)
     is_exact = isinstance(plant, LinearPlant) and not plant.circular

@@ -90,6 +90,10 @@ def _convert_to_steps(origin: Origin, horizons: Horizons) -> np.ndarray:
     """Return how many steps ahead each horizon is (horizons,), from numbers of steps, spans of time, or dates.
 
     A single whole number stands for each step up to it.
+
+    Args:
+        origin: where the data end: time of the last row, and time between rows.
+        horizons: a number of steps, or a list of steps, spans of time or dates.
     """
     if is_whole(horizons):
         return np.arange(1.0, _require_step_count(horizons) + 1)
@@ -98,6 +102,11 @@ def _convert_to_steps(origin: Origin, horizons: Horizons) -> np.ndarray:
 
 def _convert_horizon_to_steps(origin: Origin, horizon: object) -> float:
     """Return how many steps ahead one horizon is: a number of steps, a span of time or a date.
+
+    Args:
+        origin: where the data end: `time` of the last row, and `spacing` between rows in seconds, or `months` where
+            steps are whole months.
+        horizon: a number of steps, a span of time or a date.
 
     Raises:
         ValueError: no whole number of steps, or a time where that of a step is not known.
@@ -122,7 +131,12 @@ def _convert_horizon_to_steps(origin: Origin, horizon: object) -> float:
 
 
 def _count_months(origin: Origin, horizon: object) -> int | None:
-    """Return how many calendar months ahead a date, or a span of months or years, is; None for anything else."""
+    """Return how many calendar months ahead a date, or a span of months or years, is; None for anything else.
+
+    Args:
+        origin: where the data end, for the date of the last row.
+        horizon: a date, a span of time or a number.
+    """
     if isinstance(horizon, np.timedelta64):
         unit, size = np.datetime_data(horizon)
         return int(horizon.astype(np.int64)) * size * MONTHS[unit] if unit in MONTHS else None
@@ -136,6 +150,10 @@ def _convert_to_times(origin: Origin, horizons: Horizons) -> np.ndarray:
     """Return how far ahead each horizon is (horizons,), in the unit of dt; spans of time and dates give seconds.
 
     A single whole number stands for each step of the usual size up to it.
+
+    Args:
+        origin: where the data end: `time` of the last row, and the usual time between rows (`spacing`).
+        horizons: a number of steps, or a list of numbers in the unit of dt, spans of time or dates.
     """
     if is_whole(horizons):
         if not origin.spacing > 0:
@@ -169,7 +187,11 @@ def _list_horizons(horizons: object) -> list[object]:
 def _convert_to_seconds(origin: Origin, horizon: object) -> float | None:
     """Return how many seconds ahead a span of time or a date is; None of a number.
 
-    TIME_STEP: the input dt, the time to the next step; a span or date needs it in seconds. SECOND: nanoseconds.
+    If the plant has an input dt (TIME_STEP), the time to the next step, its unit has to be seconds.
+
+    Args:
+        origin: where the data end: its model, whose inputs may say the unit of dt, and the time of the last row.
+        horizon: a span of time, a date or a number.
     """
     if isinstance(horizon, timedelta | np.timedelta64):
         unit = units_in(origin.model.inputs).get(TIME_STEP, "s") if isinstance(origin.model, HasInputs) else "s"
@@ -185,6 +207,10 @@ def _convert_to_seconds(origin: Origin, horizon: object) -> float | None:
 
 def _read_date_ahead(origin: Origin, horizon: datetime | np.datetime64) -> tuple[np.datetime64, np.datetime64]:
     """Return a date ahead and the date at which the data end, both in nanoseconds.
+
+    Args:
+        origin: where the data end.
+        horizon: the date.
 
     Raises:
         ValueError: a date that is missing or not after the data, or that 64 bits of nanoseconds cannot say.
@@ -209,6 +235,10 @@ def _convert_span_to_seconds(span: timedelta | np.timedelta64) -> float:
 
 def _find_end_of_data(origin: Origin, horizon: datetime | np.datetime64) -> np.datetime64:
     """Return the date at which the data end, which must be the same for all sources.
+
+    Args:
+        origin: where the data end; several sources have a time each.
+        horizon: the horizon that asks for it, for messages.
 
     Raises:
         ValueError: data without dates, or sources that end at different dates.

@@ -208,7 +208,12 @@ class MultistepPredictor(Module):
 
         The filter's innovation z - E[z] at z = 0 has the value -E[z] and the covariance of z. Noise with outliers is a
         mixture of Gaussians ("branches"), and so is then the law of each number of z (`laws`): a Gaussian with the
-        variance of z less that of the noise, plus this noise. `outputs`: moments of what the sensor would measure.
+        variance of z less that of the noise, plus this noise.
+
+        Args:
+            prior: the filter's state, predicted for step k.
+            outputs: moments of what the sensor would measure then, or None.
+            k: the step.
         """
         if not self.receives:
             return None
@@ -246,14 +251,28 @@ def _condition_on_limits(filter: AbstractFilter, state: PyTree) -> tuple[Abstrac
 
 
 def _measure_in_each_mode(filter: MultipleModelFilter, prior: PyTree, k: jax.Array) -> Moments:
-    """Return the moments of the outputs at step k, a mixture with a Gaussian for each mode of the filter."""
+    """Return the moments of the outputs at step k, a mixture with a Gaussian for each mode of the filter.
+
+    Args:
+        filter: the filter, which weighs modes by their probability.
+        prior: the filter's state, predicted for step k.
+        k: the step.
+    """
     signal, weights = filter.prior_signals(prior, k)
     covariances = jax.vmap(lambda of_mode: of_mode.covariance)(signal)
     return Moments(weights=weights, means=signal.mean, covariances=covariances)
 
 
 def _measure_unknown_state(prior: Diffuse, sensor: LinearSensor) -> Moments:
-    """Return the moments of the outputs if part of the state is unknown; some variances are then infinite."""
+    """Return the moments of the outputs if part of the state is unknown; some variances are then infinite.
+
+    Before the first measurements nothing is known of some states; what a sensor would measure of these has an infinite
+    variance.
+
+    Args:
+        prior: the filter's predicted state, with a mean, a covariance and the directions that are unknown.
+        sensor: the sensor of the step.
+    """
     covariance, unknown = project_diffuse(prior, jnp.asarray(sensor.matrix))
     noise = jnp.asarray(sensor.noise.covariance)
     mean = jnp.asarray(sensor.matrix) @ prior.mean + jnp.asarray(sensor.noise.mean)
@@ -261,7 +280,16 @@ def _measure_unknown_state(prior: Diffuse, sensor: LinearSensor) -> Moments:
 
 
 def _find_innovation_of_zero(filter: AbstractFilter, prior: PyTree, k: jax.Array) -> Innovation:
-    """Return the innovation z - E[z] of z = 0, that is -E[z], with the covariance of z, for the predicted state."""
+    """Return the innovation z - E[z] of z = 0, that is -E[z], with the covariance of z, for the predicted state.
+
+    A filter has no function that predicts z, but its correction compares z with that prediction: by z = 0 it becomes
+    visible. Filters that are wrapped around another one are taken apart until one predicts z itself.
+
+    Args:
+        filter: the filter.
+        prior: its state, predicted for step k.
+        k: the step.
+    """
     filter, prior = _condition_on_limits(filter, prior)
     if isinstance(filter, FilterOfInputs):
         return _find_innovation_of_zero(filter.make_filter_under(prior.u, k), prior.base, k)
@@ -332,7 +360,15 @@ def _compute_moments_now(predictor: MultistepPredictor, state: PyTree) -> Moment
 
 
 def find_output_claim(filter: AbstractFilter, predictor: MultistepPredictor) -> Claim:
-    """Return the claim of predicted outputs: the filter's, or "nominal" for angles and nonlinear sensors."""
+    """Return the claim of the predicted outputs: what their covariance is said to be.
+
+    It is that of the filter, "exact", "upper", "nominal" or "none". Moments through a nonlinear sensor, and those of
+    angles, are approximate: the claim is at most "nominal" then.
+
+    Args:
+        filter: the filter.
+        predictor: predicts its states and outputs; has the sensor.
+    """
     sensor = first(predictor.sensor)
     is_exact = isinstance(sensor, LinearSensor) and not sensor.circular
     return filter.claim if is_exact or filter.claim == "none" else weakest([filter.claim, "nominal"])

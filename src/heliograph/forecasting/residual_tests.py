@@ -196,7 +196,12 @@ def _standardise(predicted: Forecast, rows: np.ndarray, angles: Angles, lags: in
 
 
 def _multiply_pairs(e: np.ndarray, lag: int) -> np.ndarray:
-    """Return the products e_t e_(t+lag) of residuals (steps,) of which both came."""
+    """Return the products e_t e_(t+lag) of residuals (steps,) of which both came.
+
+    Args:
+        e: residuals (steps,), NaN where nothing arrived.
+        lag: distance of the rows that are multiplied.
+    """
     products = e[lag:] * e[: len(e) - lag]
     return np.asarray(products[~np.isnan(products)])
 
@@ -211,6 +216,10 @@ def _test_correlation(e: np.ndarray, lags: int) -> float:
 
     r_l = sum e_t e_(t+l) / sum e_t^2 over what came: n residuals, and n_l pairs of lag l. The result is NaN for n below
     LEAST.
+
+    Args:
+        e: residuals (steps,), NaN where nothing arrived.
+        lags: number of lags l.
     """
     n = int(np.sum(~np.isnan(e)))
     if n < LEAST:

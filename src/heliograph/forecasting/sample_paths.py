@@ -286,7 +286,11 @@ def _draw_paths_from_states(
 def _draw_outputs(sensor: Any, x: jax.Array, key: jax.Array, learned: Array | None) -> jax.Array:
     """Return what a sensor measures (m,) of a state x, with noise drawn from its law.
 
-    `learned`: factors (m,) of the noise's deviations, if a filter learned them; else None.
+    Args:
+        sensor: the sensor of the step.
+        x: the state (n,).
+        key: of the random numbers.
+        learned: factors (m,) of the noise's deviations, if a filter learned them; else None.
     """
     law, noise = sensor.noise, sensor.noise.sample(key)
     if learned is not None:

@@ -47,6 +47,10 @@ def compute_probability_below(law: MixtureLaws, values: np.ndarray) -> np.ndarra
     """Return P(X < value) of each row (rows,), X being of the row's law: uniform on (0, 1) where the laws are right.
 
     Of a value that a part knows exactly (variance 0) it is P(less) + P(equal) / 2: 1/2 where that is what came.
+
+    Args:
+        law: each row's forecast, a mixture of Gaussians.
+        values: what came (rows,), NaN where nothing did.
     """
     return np.asarray(np.sum(law.weights * ndtr(_standardise(values[:, None] - law.means, law.variances)), axis=1))
 
@@ -65,6 +69,10 @@ def is_known_and_came(law: MixtureLaws, values: np.ndarray) -> np.ndarray:
     """Return in which rows the law knows the value, but for rounding, and it came (rows,).
 
     Any interval about such a forecast holds what comes, whatever share it claims, so it tests no coverage.
+
+    Args:
+        law: each row's forecast.
+        values: what came (rows,).
     """
     rounding = ROUNDING * np.abs(law.mean)
     is_known = (np.sqrt(law.variances) <= rounding[:, None]).all(axis=1)
@@ -76,6 +84,10 @@ def log_score(law: MixtureLaws, values: np.ndarray) -> np.ndarray:
 
     The largest term is taken out of the sum, so that not every exponential is 0. Of what is known exactly (variance 0)
     the density is infinite where it came, and 0 elsewhere. LOG_TURN: log(2 pi).
+
+    Args:
+        law: each row's forecast, a mixture of Gaussians.
+        values: what came (rows,), NaN where nothing did.
     """
     squares = _standardise(values[:, None] - law.means, law.variances) ** 2
     with np.errstate(divide="ignore"):  # a part may have weight 0, or variance 0
@@ -93,6 +105,10 @@ def crps(law: MixtureLaws, values: np.ndarray) -> np.ndarray:
 
     It is E|X - z| - E|X - X'| / 2 for independent X and X' of the law. For one Gaussian it is
     s (t (2 Phi(t) - 1) + 2 phi(t) - pi^(-1/2)) with t = (z - m) / s.
+
+    Args:
+        law: each row's forecast, a mixture of Gaussians.
+        values: what came, z (rows,), NaN where nothing did.
 
     Source: Gneiting and Raftery, Strictly proper scoring rules (2007); Grimit et al. (2006) for mixtures.
     """

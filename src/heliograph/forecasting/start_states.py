@@ -68,7 +68,13 @@ def _stack_origins(origins: list[Origin]) -> Origin:
 
 
 def _check_like_first(name: str, head: Origin, origin: Origin) -> None:
-    """Raise ValueError unless an origin has the model, the steps and the kind of times of the first origin, `head`."""
+    """Raise ValueError unless an origin has the model, the steps and the kind of times of the first origin, `head`.
+
+    Args:
+        name: name of the source, for messages.
+        head: origin of the first source.
+        origin: origin of this source.
+    """
     if origin.model is not head.model:
         raise fail(name, "the filter or network of the source before it", "another one")
     if not np.array_equal([head.spacing, head.months], [origin.spacing, origin.months], equal_nan=True):

@@ -72,7 +72,11 @@ def _evaluate_row_likelihoods(solution: Solution, points: np.ndarray) -> np.ndar
 def _make_posterior(solution: Solution, points: np.ndarray) -> "xr.Dataset":
     """Return the free numbers of the table (for instance logarithms of variances) at posterior draws, as a dataset.
 
-    `points`: draws of their unconstrained coordinates (draws, p). All draws are one chain, axis 0.
+    All draws are one chain, axis 0.
+
+    Args:
+        solution: the fit.
+        points: draws of the unconstrained coordinates of the free numbers (draws, p).
     """
     values = np.stack([solution.parameters.entries_at(x) for x in points])  # (draws, entries)
     names = [entry.name for entry in solution.parameters.entries]
@@ -82,7 +86,9 @@ def _make_posterior(solution: Solution, points: np.ndarray) -> "xr.Dataset":
 def _select_arrived_rows(solution: Solution, density: np.ndarray) -> "xr.Dataset":
     """Return log p (draws, rows) of the rows in which something arrived, with the recording and row of each.
 
-    `density`: log p of all rows of all recordings (draws, rows).
+    Args:
+        solution: the fit, with its data.
+        density: log p of all rows of all recordings, one recording after the other (draws, rows).
     """
     data = solution.surface.data
     rows = [(i, k) for i, steps in enumerate(data.lengths) for k in range(steps)]
@@ -98,7 +104,12 @@ def _make_total_likelihood_dataset(density: np.ndarray) -> "xr.Dataset":
 
 
 def _make_dataset(content: dict[str, Any], further_coordinates: dict[str, Any] | None = None) -> "xr.Dataset":
-    """Return a dataset of arrays (chain, draw, ...), given as {name: (axes, values)}; the one chain has number 0."""
+    """Return a dataset of arrays (chain, draw, ...), given as {name: (axes, values)}; the one chain has number 0.
+
+    Args:
+        content: {name: (names of the axes, values)}, of which the first two axes are chain and draw.
+        further_coordinates: {name: (axis, values)} of other axes; none unless given.
+    """
     import xarray as xr
 
     _axes, values = next(iter(content.values()))

@@ -62,7 +62,13 @@ def round_to_width(value: float, width: float) -> str:
 
 
 def make_unidentified_row(entry: TableEntry, value: float, form: Form) -> Row:
-    """Return the row of a number that the data do not identify: where the search ended, without an interval."""
+    """Return the row of a number that the data do not identify: where the search ended, without an interval.
+
+    Args:
+        entry: the number, with its name.
+        value: where the search ended.
+        form: form of the likelihood that was maximised.
+    """
     return Row(
         name=entry.name,
         estimate=value,

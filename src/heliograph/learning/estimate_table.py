@@ -171,7 +171,12 @@ class Solution:
         return np.asarray(self.basis @ sandwich @ self.basis.T), estimate.freedom
 
     def rows(self, method: Method = "cosines", level: float = LEVEL) -> tuple[Row, ...]:
-        """Return the table of estimates by this form, with intervals by a method; it is computed at the first call."""
+        """Return the table of estimates by this form, with intervals by a method; it is computed at the first call.
+
+        Args:
+            method: how intervals are computed, as of `Fit.rows`.
+            level: probability with which an interval holds the number.
+        """
         key = method, level
         if key not in self._tables:
             self._tables[key] = self._make_rows(method, level)
@@ -199,7 +204,12 @@ class Solution:
     def _describe_entry(self, entry: TableEntry, value: float, slope: np.ndarray, error: float) -> str:
         """Return in words an estimate `value` and its interval, symmetric in the unconstrained number (log or logit).
 
-        `error`: its standard error there. `slope`: its derivative, which shows whether it is identified.
+        Args:
+            entry: the number, with its domain.
+            value: its estimate.
+            slope: derivative of the unconstrained number by the active coordinates, which shows whether it is
+                identified.
+            error: standard error of the unconstrained number.
         """
         if entry.coordinate is not None and not self.active[entry.coordinate]:
             return f"{value:>10.4g}  (at the end of its domain)"
@@ -212,7 +222,12 @@ class Solution:
         return f"{row.value:>10}  (about {row.interval})"
 
     def _make_rows(self, method: Method, level: float) -> tuple[Row, ...]:
-        """Return a row for each number of the table: at a boundary, not identified, or with an interval by `method`."""
+        """Return a row for each number of the table: at a boundary, not identified, or with an interval by `method`.
+
+        Args:
+            method: how intervals are computed, as of `Fit.rows`.
+            level: probability with which an interval holds the number.
+        """
         covariance, freedom = self.covariance("hessian" if method == "profile" else method)
         # Estimates at the maximum, and their derivatives by the active coordinates x (logarithms, logits or numbers).
         values, slopes = self.parameters.entries_at(self.x), self.parameters.slopes(self.top.x)[:, self.active]
@@ -305,7 +320,11 @@ class Solution:
     def _bootstrap_interval(self, slopes: np.ndarray, level: float) -> np.ndarray:
         """Return both ends of an interval, relative to the estimate, from DRAWS sums of blocks of scores drawn again.
 
-        `slopes`: the number's derivative by the active coordinates. A sum of scores moves the maximum by H^-1 times it.
+        A sum of scores moves the maximum by H^-1 times it.
+
+        Args:
+            slopes: derivatives of the number's unconstrained coordinate by the active coordinates (active,).
+            level: probability with which the interval holds the number.
         """
         sums = bootstrap_block_sums([s @ self.basis for s in self.scores], draws=DRAWS, seed=0)
         moves = slopes @ self.basis @ np.linalg.solve(self.hessian, sums.T)
@@ -315,7 +334,12 @@ class Solution:
         """Return the row of a number at an end of its domain: its interval is from there to one point inside.
 
         At an end 2 * (fall of l) is chi-squared with probability 1/2 and else 0: P(fall > d) = P(chi2 > 2 d) / 2. So an
-        interval of 95 % ends where an ordinary one of 90 % = 2 * 95 % - 1 does. FURTHER: where the search begins.
+        interval of 95 % ends where an ordinary one of 90 % = 2 * 95 % - 1 does.
+
+        Args:
+            entry: the number.
+            value: its estimate, the end of its domain.
+            level: probability with which the interval holds the number.
         """
         assert entry.coordinate is not None
         outward = self.top.ends[entry.coordinate]  # -1 or 1

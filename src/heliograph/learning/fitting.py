@@ -208,7 +208,12 @@ def _require_information_on_each_number(surface: LikelihoodSurface, points: np.n
 
 
 def _make_climb_reporter(surface: LikelihoodSurface, say: Progress) -> Callable[[ClimbEnds], None]:
-    """Return the function that reports, after each step of a search, how many climbs are done and how high they are."""
+    """Return the function that reports, after each step of a search, how many climbs are done and how high they are.
+
+    Args:
+        surface: the likelihood that is climbed.
+        say: called with a line of text.
+    """
     form = surface.objective.form
 
     def report(climbs: ClimbEnds) -> None:

@@ -160,6 +160,12 @@ def _transform_by_laws(network: Network, node: Node, z: np.ndarray, inputs: np.n
     """Return P(z_k <= what came | earlier rows) of each measurement (rows, received), by laws of gain and noise.
 
     The result is None if these laws of the node vary over time, remember, or have no nodes to sum over.
+
+    Args:
+        network: the network, for its plant.
+        node: the node, for its sensor and channel.
+        z: measurements (rows, received), NaN where nothing arrived.
+        inputs: inputs of the plant (rows, inputs).
     """
     models = (network.plant, node.sensor, node.channel)
     if any(isinstance(model, OverTime) for model in models) or first(node.channel).remembers:

@@ -126,6 +126,11 @@ def identify_by_recording(surface: LikelihoodSurface, start: Float[np.ndarray, "
 
     `late` is the information of the recording's second half, in which what is known before the first step counts least.
     Points where it is not finite are left out. If it is finite at none, only the start is judged.
+
+    Args:
+        surface: the likelihood of the recording.
+        start: unconstrained coordinates of the free numbers (p,).
+        seed: of the points that are drawn.
     """
     points = _draw_points_near(start, seed)
     late = surface.evaluations(np.stack(points)).late
@@ -170,7 +175,9 @@ def _judge_identifiability(
 def describe_unidentified(identifiability: Identifiability, solution: "Solution | None") -> tuple[str, ...]:
     """Return sentences on the numbers that are not identified, and on the products or sums of them that are.
 
-    `solution`: the maximum, whose estimates and intervals the sentences quote; None where there is none yet.
+    Args:
+        identifiability: which numbers, and which combinations of them, are identified.
+        solution: the maximum, whose estimates and intervals the sentences quote; None where there is none yet.
     """
     names = identifiability.parameters.coordinates
     lines = [

@@ -110,6 +110,10 @@ class _MarkedNumber:
         A number may stand in several places, such as one variance in two sensors. A kind that the user gave stays. Two
         intervals are intersected. A check that requires nothing (REAL) changes nothing. Any other domain replaces the
         known one.
+
+        Args:
+            name: name of the argument in whose place the number stands.
+            domain: values that are allowed there.
         """
         self.place = self.place or name  # the first place gives the name
         if self.explicit:

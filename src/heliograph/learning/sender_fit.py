@@ -264,7 +264,13 @@ def _climb_simplex(
 
 
 def _make_row_without_interval(description: Description, x: Float[np.ndarray, " p"], index: int) -> Row:
-    """Return the table's row for free number `index` at the maximum x (p,), without interval and standard error."""
+    """Return the table's row for free number `index` at the maximum x (p,), without interval and standard error.
+
+    Args:
+        description: the network with its free numbers.
+        x: unconstrained coordinates of the maximum (p,).
+        index: number of the entry of the table.
+    """
     return Row(
         name=description.parameters.entries[index].name,
         estimate=float(description.parameters.entries_at(x)[index]),

@@ -99,6 +99,10 @@ def _differentiate_coordinates(parameters: Parameters, x: Float[np.ndarray, " p"
     """Return dv/dx and d log|v|/dx (p,) at x (p,), for each coordinate that belongs to one number v of the table.
 
     For other coordinates both are 1.
+
+    Args:
+        parameters: the free numbers.
+        x: the point in unconstrained coordinates (p,).
     """
     slopes, log_slopes = np.ones(len(x)), np.ones(len(x))
     for entry, dv_dx, v in zip(parameters.entries, parameters.jacobian(x), parameters.entries_at(x), strict=True):
@@ -204,7 +208,12 @@ def _reduce_to_echelon(rows: np.ndarray) -> np.ndarray:
 
 
 def format_product(names: list[str], exponents: Float[np.ndarray, " numbers"]) -> str:
-    """Return the text of a product of powers, such as "a * b^2 / c"."""
+    """Return the text of a product of powers, such as "a * b^2 / c".
+
+    Args:
+        names: names of the numbers.
+        exponents: exponent of each (numbers,).
+    """
     powers = list(zip(names, exponents, strict=True))
     factors = [_format_power(name, exponent) for name, exponent in powers if exponent > 0]
     divisors = [_format_power(name, -exponent) for name, exponent in powers if exponent < 0]
@@ -215,6 +224,10 @@ def format_sum(names: list[str], weights: Float[np.ndarray, " numbers"]) -> str:
     """Return the text of a weighted sum, such as "a + 0.64 b".
 
     A weight within SAME of 1 or -1 is not written, and a term of weight 0 is left out.
+
+    Args:
+        names: names of the numbers.
+        weights: weight of each (numbers,).
     """
     text = ""
     for name, weight in zip(names, weights, strict=True):

@@ -82,6 +82,10 @@ def _are_rows(network: Network, entries: object) -> bool:
     """Return whether the entries of a list are the rows of one recording, rather than recordings.
 
     They are rows if each is a number, or has as many numbers as the only node receives, as in `array.tolist()`.
+
+    Args:
+        network: the network, whose only node says how many numbers a row has.
+        entries: the list.
     """
     try:
         values = np.asarray(entries)
@@ -93,7 +97,13 @@ def _are_rows(network: Network, entries: object) -> bool:
 
 
 def _pick_inputs(inputs: object, index: int, several: Sequence[object]) -> object:
-    """Return the inputs of recording number `index`: its entry if `inputs` is a list, else those of all recordings."""
+    """Return the inputs of recording number `index`: its entry if `inputs` is a list, else those of all recordings.
+
+    Args:
+        inputs: inputs for all recordings, or a list with those of each.
+        index: number of the recording.
+        several: all recordings.
+    """
     if not isinstance(inputs, list | tuple):
         return inputs
     if len(inputs) != len(several):
@@ -104,7 +114,11 @@ def _pick_inputs(inputs: object, index: int, several: Sequence[object]) -> objec
 def _split_truth(network: Network, several: Sequence[object], truth: Any, steps: list[int]) -> list[np.ndarray]:
     """Return the true states (steps, n) of each run of each recording, NaN where they are not known.
 
-    `truth`: True for those in the recordings, else the states, or a list of them. `steps`: length of each run.
+    Args:
+        network: the network, for its states.
+        several: the recordings.
+        truth: True for the states in the recordings, else the states, or a list of them.
+        steps: length of each run.
 
     Raises:
         ValueError: recordings without them, other shapes.
@@ -196,7 +210,13 @@ def _list_runs(values: list[np.ndarray]) -> list[list[np.ndarray]]:
 
 
 def _pad_rows(values: np.ndarray, length: int, filler: float | None) -> np.ndarray:
-    """Return the array (rows, columns) padded to a length, with rows of `filler` or, if it is None, of the last row."""
+    """Return the array (rows, columns) padded to a length, with rows of `filler` or, if it is None, of the last row.
+
+    Args:
+        values: rows of one run (rows, columns).
+        length: number of rows that the result has.
+        filler: value of the added rows, or None.
+    """
     missing = length - len(values)
     added_row = values[-1:] if filler is None else np.full((1, values.shape[1]), filler)
     return np.concatenate([values, np.repeat(added_row, missing, axis=0)]) if missing else values

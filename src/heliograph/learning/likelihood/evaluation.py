@@ -129,7 +129,11 @@ def _evaluate_side_by_side(objective: Objective, x: np.ndarray, data: Likelihood
     """Return the evaluation of all recordings, row by row, at all points x (points, p), each pair side by side.
 
     Our own compiled code computes it if `choose_code` finds some for these arguments, else XLA, pair by pair.
-    `halves`: the information in the first and in the second half of the rows, summed over recordings.
+
+    Args:
+        objective: makes the filter from the free numbers.
+        x: the points (points, p).
+        data: the recordings.
     """
     data_rows = [rows for rows in (data.measurements, data.inputs, data.truth) if rows is not None]
     # Pair each point with each recording, point after point.
@@ -197,7 +201,15 @@ def _differentiate_errors(
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
     """Return e (steps, m), its covariance S (steps, m, m), and their derivatives in the p numbers x.
 
-    e: innovations, or with `truth` errors of the estimates. de (steps, p, m), dS (steps, p, m, m), by forward mode.
+    e are the innovations, or with `truth` the errors of the estimates. The derivatives de (steps, p, m) and dS (steps,
+    p, m, m) are by forward mode.
+
+    Args:
+        objective: makes the filter from the free numbers.
+        x: the free numbers as unconstrained coordinates (p,).
+        z: measurements (steps, received).
+        u: inputs (steps, inputs).
+        truth: true states (steps, n), or None.
     """
 
     def errors_at(x: Array) -> tuple[jax.Array, jax.Array]:

@@ -126,6 +126,11 @@ class MaximumSearch:
 
         Logarithms and logits are drawn within SPREAD of the maximum, real numbers within AWAY standard errors. The
         extra point of a number has its logarithm or logit lowered by LOWERED.
+
+        Args:
+            top: the maximum.
+            count: number of points drawn around it.
+            seed: of the random numbers.
         """
         deviation = self.surface.standard_errors(top.x)
         spread = np.where(self.surface.domains.free, AWAY * np.where(np.isfinite(deviation), deviation, 0.0), SPREAD)

@@ -112,8 +112,7 @@ class Objective:
         def judged(state: PyTree, innovation: Innovation, k: jax.Array) -> tuple[jax.Array, jax.Array]:
             """Return a row's innovation and its covariance, or 0 and NaN if the filter has lost its estimate (NaN).
 
-            The NaN makes the likelihood NaN. An innovation of NaN would count as a row where nothing arrived. `filter`:
-            the filter at the values of the free numbers.
+            The NaN makes the likelihood NaN. An innovation of NaN would count as a row where nothing arrived.
             """
             is_lost = jnp.any(jnp.isnan(jnp.asarray(filter.estimate(state).mean)))
             value, covariance = jnp.asarray(innovation.value), jnp.asarray(innovation.covariance)

@@ -106,6 +106,14 @@ class Predictive(NamedTuple):
 def make_signal_filter(plant: AnyPlant, sensor: AnySensor, channel: AbstractRandomAffine) -> Any:
     """Return the filter that predicts what the sensor sends (`expect_signals`).
 
+    It is the filter of the conditional form of a fit: it knows mean and covariance of gains, and its prior is
+    Gaussian.
+
+    Args:
+        plant: the plant.
+        sensor: the sensor.
+        channel: the channel, given that something arrives.
+
     Raises:
         ValueError: a plant or sensor with modes, or an unknown start.
     """

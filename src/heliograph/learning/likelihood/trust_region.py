@@ -217,7 +217,14 @@ def _accept_or_reject_steps(
 
 
 def _evaluate_at(evaluate: Evaluate, x: np.ndarray, going: np.ndarray, state: Climbs) -> Evaluated:
-    """Return log-likelihood, gradient and information at x (climbs, p) of climbs `going` on, else the last ones."""
+    """Return log-likelihood, gradient and information at x (climbs, p) of climbs `going` on, else the last ones.
+
+    Args:
+        evaluate: function of points (points, p) that returns the three.
+        x: a point for each climb (climbs, p).
+        going: climbs that are evaluated (climbs,); the others are done.
+        state: the climbs, with their last values.
+    """
     arrays = state.total.copy(), state.gradient.copy(), state.information.copy()
     for array, new_values in zip(arrays, evaluate(x[going]), strict=True):
         array[going] = new_values

@@ -207,6 +207,10 @@ def _fit_laws(parts: Fates, intervals: bool) -> dict[str, AbstractLossLaw]:
 
     One Markov law looks back over one packet, the other over LONG packets. HIDDEN has a good and a bad mode that are
     not seen. RUNNING follows the share of losses as it drifts.
+
+    Args:
+        parts: stretches of fates: 0 arrived, 1 lost, NaN unknown.
+        intervals: whether to compute the intervals.
     """
     return {
         INDEPENDENT: IndependentLosses.fit(parts),
