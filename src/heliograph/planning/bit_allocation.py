@@ -48,6 +48,10 @@ def _refuse_overload(network: Network, encoders: Mapping[str, Words]) -> None:
     """Raise ValueError if words of these senders overload in more than 1 of 1000 steps of the steady state.
 
     Their error is not that of rounding then. The linear filter of the words judges it, from the steady law on.
+
+    Args:
+        network: the network, with its plant, sensors and channels.
+        encoders: encoder of each node that sends, by the name of the node.
     """
     plant = network.plant
     assert isinstance(plant, LinearPlant) and isinstance(plant.noise, AbstractNoise)
@@ -203,6 +207,10 @@ def _compute_steady_covariance(senders: _PlantAndSenders, j: Float[np.ndarray, "
     """Return the steady covariance P = (X^-1 + sum_i j_i c_i c_i')^-1 after words of information j.
 
     X is the covariance before the words, and c_i the row of sender i.
+
+    Args:
+        senders: the plant, and the rows c_i of the senders.
+        j: information of each sender's word, 1 over its noise's variance; 0 if it sends nothing (senders,).
     """
     # Leave out senders of no bits, whose noise 1 / j is infinite.
     sends = j > 0
@@ -227,6 +235,10 @@ def _compute_error_slopes(senders: _PlantAndSenders, j: Float[np.ndarray, " send
     """Return the derivatives of the steady trace by each j_i: -c_i' P Y P c_i, with Y = I + M' Y M.
 
     P is the covariance after the words, X before them, and M = (I - K C) A = P X^-1 A maps the error from step to step.
+
+    Args:
+        senders: the plant, and the rows c_i of the senders.
+        j: information of each sender's word (senders,).
     """
     A, Q = senders.transition, senders.process
     P = _compute_steady_covariance(senders, j)
@@ -242,6 +254,10 @@ def _add_bits_greedily(senders: _PlantAndSenders, total: int) -> Float[np.ndarra
     """Return the bits of each sender, added where the error falls most for a bit, until `total` of them are spent.
 
     Several may be added at once to one sender; fewer are spent where none lowers the error.
+
+    Args:
+        senders: plant, sensors, and the information of a word by its bits.
+        total: bits of all words of a step together.
     """
     bits = np.zeros(len(senders.rows), dtype=int)
     error = _compute_steady_error(senders, _information_of_bits(senders, bits))
@@ -267,8 +283,12 @@ def _bound_by_relaxation(senders: _PlantAndSenders, total: int) -> float:
     """Return a lower bound of the error for any split of this total of bits, with real bits and concave information.
 
     The error is convex in j, so its tangent at any j is nowhere above it, and the tangent's least value over all splits
-    is a bound. The points j come from Frank and Wolfe's steps j + 2 / (k + 2) (best - j). `hulls`: the concave envelope
-    of each sender's information over its bits, on which bits may be real.
+    is a bound. The points j come from Frank and Wolfe's steps j + 2 / (k + 2) (best - j). Bits may be real numbers on
+    the concave envelope of each sender's information over its bits (`hulls`).
+
+    Args:
+        senders: plant, sensors, and the information of a word by its bits.
+        total: bits of all words of a step together.
     """
     hulls = [_find_envelope(values) for values in senders.information]
     j, bound = np.zeros(len(hulls)), -np.inf

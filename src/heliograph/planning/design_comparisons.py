@@ -230,8 +230,15 @@ def _list_relays(
 ) -> dict[str, DesignProblem]:
     """Return {name of a change: the design problem} with a relay in the middle of each hop of the node `name`.
 
-    `nodes`: all, without filters. A relay changes the numbers in the names of hops behind it, so that nodes are free as
+    A relay changes the numbers in the names of hops behind it, so that nodes are free as
     a whole. It has the limits of the transmitter whose hop it halves.
+
+    Args:
+        problem: the design problem of the unchanged network.
+        network: the unchanged network.
+        nodes: all its nodes, without filters.
+        name: name of the node whose hops get a relay.
+        exponent: exponent of the path loss: power falls as distance^-exponent.
     """
     node, problems, free = nodes[name], dict[str, DesignProblem](), _list_free_names(problem)
     assert isinstance(node.channel, AbstractRandomAffine)

@@ -249,6 +249,11 @@ def _require_scalar_system(plant: AnyPlant, sensor: AnySensor, without_inputs: b
     """Return a, q, c, r of a linear plant and sensor of one number and Gaussian noise each; ValueError for others.
 
     Refused are angles too, a plant without noise and a sensor of nothing, behind which there is nothing to send.
+
+    Args:
+        plant: the plant.
+        sensor: the sensor.
+        without_inputs: whether a plant with inputs is refused too.
     """
     expected = "a LinearPlant and LinearSensor of one state and output"
     if not isinstance(plant, LinearPlant) or not isinstance(sensor, LinearSensor):

@@ -95,7 +95,13 @@ def repeat_network(network: Network) -> Network:
 
 
 def _check_powers(powers: object, nodes: Mapping[str, Node], steps: int) -> dict[str, Float[np.ndarray, "steps"]]:
-    """Return the powers (steps,) by transmitter; raise ValueError for unknown names, bad shapes, negative powers."""
+    """Return the powers (steps,) by transmitter; raise ValueError for unknown names, bad shapes, negative powers.
+
+    Args:
+        powers: {transmitter: (steps,)}, as the user gives them.
+        nodes: nodes by name, whose channels have the transmitters.
+        steps: number of steps.
+    """
     known = {f"{name}.{hop}" for name, node in nodes.items() for hop in transmitter_names(first(node.channel))}
     given = table("powers of a network", powers, "powers")
     unknown = sorted(set(given) - known)
@@ -111,6 +117,11 @@ def add_best_filter(plant: AnyPlant, node: Node, channel: Channel) -> Node:
     """Return the node with this channel, and with the best linear filter behind it as its only filter.
 
     The node's limits were made for its own channel. Behind another channel, only its invalid values still hold.
+
+    Args:
+        plant: the plant.
+        node: the node, with its sensor and limits.
+        channel: the channel that it gets.
     """
     filters = {BEST: linear_filter(plant, node.sensor, channel)}
     if node.limits is None or are_same(channel, node.channel):

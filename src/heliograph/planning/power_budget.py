@@ -61,7 +61,12 @@ def make_budget(value: object) -> Budget:
 
 
 def _read_limit(name: str, value: ArrayLike | Mapping[str, float] | None) -> PerTransmitter:
-    """Return a checked limit of powers: a number for all transmitters, {name: number} for some, or None for none."""
+    """Return a checked limit of powers: a number for all transmitters, {name: number} for some, or None for none.
+
+    Args:
+        name: name of the limit, for messages.
+        value: a number, {name: number} or None, as the user gives it.
+    """
     if value is None:
         return None
     if isinstance(value, Mapping):
@@ -209,7 +214,12 @@ def make_power_limits(
 def _check_fixed_powers(what: str, power: float, limit: float) -> None:
     """Raise ValueError if transmitters that are not free already send more than a limit.
 
-    `what`: the limit, in words. A limit counts as met within the rounding MET.
+    A limit counts as met within the rounding MET.
+
+    Args:
+        what: the limit, in words.
+        power: what these transmitters send.
+        limit: the limit.
     """
     if power > limit * (1 + MET):
         expected = f"a {what} of at least {power:.6g}, which is sent by what is not free"
@@ -217,7 +227,13 @@ def _check_fixed_powers(what: str, power: float, limit: float) -> None:
 
 
 def _list_limits(kind: str, limit: PerTransmitter, names: Sequence[str]) -> Float[np.ndarray, "hop"]:
-    """Return a limit for each transmitter in the order of `names`, infinite if it has none."""
+    """Return a limit for each transmitter in the order of `names`, infinite if it has none.
+
+    Args:
+        kind: name of the limit, for messages.
+        limit: a number for all, {name: number} for some, or None.
+        names: names of the transmitters.
+    """
     if not isinstance(limit, dict):
         return np.full(len(names), np.inf if limit is None else limit)
     unknown = sorted(set(limit) - set(names))

@@ -64,6 +64,11 @@ def _choose_cells(system: ScalarSystem, delta: float, share: float) -> _CellGrid
     h is at most `share` of the standard deviation of either noise. The sender sends when the measurement is more than
     delta from the value sent last, so that delta is made the edge of a cell: (k + 1/2) h for a whole number k.
 
+    Args:
+        system: plant and sensor, with c = 1.
+        delta: a value is sent if it is further than this from the value sent last.
+        share: largest length of a cell, as a share of the deviation of either noise.
+
     Raises:
         ValueError: more cells than can be computed.
     """

@@ -220,7 +220,12 @@ def _list_cases(
 
 
 def _make_filter_of_all(network: Network, nodes: Mapping[str, Node]) -> AbstractFilter:
-    """Return the likelihood filter of everything the nodes receive, linear if plant and sensors are, without angles."""
+    """Return the likelihood filter of everything the nodes receive, linear if plant and sensors are, without angles.
+
+    Args:
+        network: the network, for its plant.
+        nodes: the nodes that are received, by name.
+    """
     # The filter skips what is lost (NaN), so a channel without memory is taken given arrival. A channel with memory,
     # such as bursts, stays as it is, since one loss changes the probability of the next.
     plant = network.plant

@@ -142,7 +142,12 @@ def power(
 
 
 def _is_exact(network: Network, sources: Sources) -> bool:
-    """Return whether second moments are exact without random draws: plant and sensors are linear without angles."""
+    """Return whether second moments are exact without random draws: plant and sensors are linear without angles.
+
+    Args:
+        network: the network, for its plant.
+        sources: sensor and channel by node.
+    """
     plant = network.plant
     all_are_linear = all(is_linear(plant, sensor) for sensor, _ in sources.values())
     have_angles = first(plant).circular or any(first(sensor).circular for sensor, _ in sources.values())
@@ -152,7 +157,14 @@ def _is_exact(network: Network, sources: Sources) -> bool:
 def _compute_moments(
     plant: AnyPlant, sources: Sources, inputs: Float[np.ndarray, "steps u"], horizon: int | None
 ) -> dict[str, Moments]:
-    """Return E (y, 1)(y, 1)' of each sensor's output (1, steps, m1, m1), as one batch, for a linear plant."""
+    """Return E (y, 1)(y, 1)' of each sensor's output (1, steps, m1, m1), as one batch, for a linear plant.
+
+    Args:
+        plant: the plant.
+        sources: sensor and channel by node.
+        inputs: inputs of the plant (steps, inputs).
+        horizon: number of steps from the initial law on; None for the steady state.
+    """
     seconds = [steady_moment_with_one(plant)] if horizon is None else moments_with_one_over(plant, len(inputs), inputs)
     return {
         name: np.array([[measured_moment_with_one(sensor, x, k) for k, x in enumerate(seconds)]])
@@ -163,13 +175,26 @@ def _compute_moments(
 def _compute_hop_powers(
     channel: Channel, moments: Moments, horizon: int | None
 ) -> dict[str, Float[np.ndarray, "batch steps"]]:
-    """Return {hop: powers (batch, steps)} of a channel's hops, from the moments E (y, 1)(y, 1)' of its input."""
+    """Return {hop: powers (batch, steps)} of a channel's hops, from the moments E (y, 1)(y, 1)' of its input.
+
+    Args:
+        channel: the channel, which may vary over time.
+        moments: E (y, 1)(y, 1)' of its input (batch, steps, m1, m1).
+        horizon: number of steps; None for the steady state.
+    """
     batches = [[_compute_powers_at(channel, k, now, horizon) for k, now in enumerate(batch)] for batch in moments]
     return {hop: np.array([[now[hop] for now in batch] for batch in batches]) for hop in batches[0][0]}
 
 
 def _compute_powers_at(channel: Channel, k: int, moment: np.ndarray, horizon: int | None) -> dict[str, float]:
-    """Return each hop's power at step k for `moment` = E (y, 1)(y, 1)', or in the long run if `horizon` is None."""
+    """Return each hop's power at step k for `moment` = E (y, 1)(y, 1)', or in the long run if `horizon` is None.
+
+    Args:
+        channel: the channel, which may vary over time.
+        k: the step.
+        moment: E (y, 1)(y, 1)' of its input at this step.
+        horizon: number of steps; None for the steady state.
+    """
     link, _, reported = separate_told_numbers(at(channel, k))
     if reported:  # a link whose gain or noise variance is reported with each message sends the same power
         if not has_untold_law(link):
@@ -209,6 +234,11 @@ def _compute_innovation_moments(
 
     y is the measurement and r its prediction by the filter at the receiver, fed back to the sensor. So d is an
     innovation: E d = 0 and E d d' = C P C' + R. P does not depend on data, so the filter is run over zeros.
+
+    Args:
+        filter: the filter at the receiver.
+        inputs: inputs of the plant (steps, inputs).
+        horizon: number of steps, which has to be given.
     """
     if horizon is None or filter.claim != "exact":
         expected = "a horizon and a linear model, whose filter knows its error before any data"
@@ -271,6 +301,13 @@ def _draw_moments(
     """Return E (y, 1)(y, 1)' of each sensor (batch, steps, m1, m1), as means over batches of drawn trajectories.
 
     There are BATCHES batches of equal size, whose differences show how exact the mean is.
+
+    Args:
+        plant: the plant.
+        sources: sensor and channel by node.
+        inputs: inputs of the plant (steps, inputs).
+        runs: number of trajectories.
+        seed: of the random numbers.
     """
     keys = jax.random.split(seed_key(seed), (BATCHES, runs // BATCHES))
     sensors = {name: sensor for name, (sensor, _) in sources.items()}

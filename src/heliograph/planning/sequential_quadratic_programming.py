@@ -187,7 +187,12 @@ class ScaledProgramme:
         return self.objective(z).value if self.is_feasible(z) else np.inf
 
     def descend(self, z: Vector, tolerance: float) -> Vector:
-        """Return the point where sequential quadratic programming ends, or the start if that is better."""
+        """Return the point where sequential quadratic programming ends, or the start if that is better.
+
+        Args:
+            z: the start, in units of each number.
+            tolerance: relative change of the objective at which a descent ends.
+        """
         constraints = []
         if len(self.limit_room(z)):
             constraints = [NonlinearConstraint(self.limit_room, 0.0, np.inf, self.limit_room_slope)]

@@ -207,7 +207,12 @@ def _make_task(
 ) -> SumOfLinksTask:
     """Return the search: which links are free, the limits of their powers, and the error by a step's information.
 
-    `names`: of the links' transmitters, in the order of the links.
+    Args:
+        problem: budget, error or target error, and which transmitters are free.
+        plant: the plant.
+        process: its noise.
+        links: the links, with their present amplitudes.
+        names: names of the links' transmitters, in the order of the links.
     """
     free = find_free_transmitters(names, problem.free)
     limits = make_unlimited(1, int(free.sum()))
@@ -231,6 +236,10 @@ def _find_least_error_amplitudes(task: SumOfLinksTask, total: float) -> tuple[Ve
     """Return the amplitudes (links,) of least error at a total power of the free links, and their certificate.
 
     A formula gives them if it holds; otherwise they are searched for.
+
+    Args:
+        task: the links, their limits and the error.
+        total: power that the free links may send together.
     """
     solution = task.find_amplitudes_by_formula(total)
     if solution is not None:
@@ -248,6 +257,10 @@ def _find_least_power_amplitudes(task: SumOfLinksTask, target: float) -> tuple[V
     """Return the amplitudes (links,) of the least power that reach a target error, and the certificate.
 
     By bisection of the power of the free links, since the least error falls with it.
+
+    Args:
+        task: the links, their limits and the error.
+        target: the target error.
     """
     best, certificate = _find_amplitudes_that_reach(task, target)
     largest = float((best**2 * task.links.unit)[task.free].sum())
@@ -267,7 +280,13 @@ def _find_least_power_amplitudes(task: SumOfLinksTask, target: float) -> tuple[V
 
 
 def _find_best_at_power(task: SumOfLinksTask, power: float, near: Vector) -> Vector:
-    """Return the best amplitudes at a power of the free links: by formula if it holds, else by descent from `near`."""
+    """Return the best amplitudes at a power of the free links: by formula if it holds, else by descent from `near`.
+
+    Args:
+        task: the links, their limits and the error.
+        power: power that the free links send together.
+        near: amplitudes at which a descent begins (links,).
+    """
     if not power > 0:
         return np.where(task.free, 0.0, task.links.present)
     solution = task.find_amplitudes_by_formula(power)
@@ -278,7 +297,11 @@ def _bound_least_power(task: SumOfLinksTask, target: float, needed: float) -> fl
     """Return the total power at which the lower bound of the error reaches the target; no less power can reach it.
 
     It is found by bisection of the free links' power, up to the total power `needed` that is known to reach the target.
-    `task.fixed`: power of the links that are not free.
+
+    Args:
+        task: the links, their limits and the error; `fixed` is the power of the links that are not free.
+        target: the target error.
+        needed: a total power of all links that reaches it.
     """
     low, high = 0.0, needed - task.fixed
     for _ in range(HALVINGS):
@@ -289,6 +312,10 @@ def _bound_least_power(task: SumOfLinksTask, target: float, needed: float) -> fl
 
 def _find_amplitudes_that_reach(task: SumOfLinksTask, target: float) -> tuple[Vector, Certificate]:
     """Return amplitudes that reach a target error: with all power within the limits, or doubled where none limits.
+
+    Args:
+        task: the links, their limits and the error.
+        target: the target error.
 
     Raises:
         ValueError: a target that is not reached.

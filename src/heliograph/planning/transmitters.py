@@ -50,6 +50,11 @@ def visit_hops(channel: AbstractRandomAffine, visit: Visit, signal: SignalMoment
 
     The signal, E (y, 1)(y, 1)' of what the hop receives, is followed through maps without memory.
 
+    Args:
+        channel: the channel.
+        visit: function of the name of a hop, the hop, and the signal that it receives; returns what takes its place.
+        signal: E (y, 1)(y, 1)' of the channel's input; None if it is not needed.
+
     Raises:
         ValueError: a map of a kind whose transmitters are not known.
     """
@@ -90,7 +95,12 @@ def select_transmitters(names: Sequence[str], chosen: Sequence[str], what: str) 
 def compute_sent_powers(channel: AbstractRandomAffine, second: Second, step: int = 0) -> dict[str, Any]:
     """Return the power (mean square of what is sent) of each transmitter at a step, by name.
 
-    The channel's modes have their law at this step, so the power is exact. `second`: E (y, 1)(y, 1)' of the input y.
+    The channel's modes have their law at this step, so the power is exact.
+
+    Args:
+        channel: the channel.
+        second: E (y, 1)(y, 1)' of its input y.
+        step: number of steps since the initial law of the modes.
 
     Raises:
         ValueError: a map of a kind whose transmitters are not known.
@@ -169,6 +179,12 @@ def set_transmitter_powers(
 ) -> AbstractRandomAffine:
     """Return the channel whose named transmitters send these powers: each amplifies what it receives to its power.
 
+    Args:
+        channel: the channel.
+        second: E (y, 1)(y, 1)' of its input y.
+        powers: {name: power} of the transmitters that change.
+        step: the step, at which the channel's modes have their law.
+
     Raises:
         ValueError: a transmitter that receives nothing which it could amplify.
     """
@@ -186,7 +202,13 @@ def set_transmitter_powers(
 
 
 def amplify_transmitter(channel: AbstractRandomAffine, name: str, factor: float | None) -> AbstractRandomAffine:
-    """Return the channel in which a transmitter amplifies by this factor more; None: it sends just what it receives."""
+    """Return the channel in which a transmitter amplifies by this factor more; None: it sends just what it receives.
+
+    Args:
+        channel: the channel.
+        name: name of the transmitter.
+        factor: by which its amplitude is multiplied, or None.
+    """
 
     def amplify(hop_name: str, hop: AbstractHop, signal: SignalMoment | None) -> AbstractHop:
         """Return the hop called `name` with its matrix times `factor`, and any other hop as it is.

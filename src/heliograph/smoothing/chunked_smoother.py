@@ -185,6 +185,11 @@ def _resmooth_wrong_ends(smooth: SmoothChunks, states: PyTree, results: Smoothed
     latter law at its end. Chunks are taken from the last to the first, since this changes the chunk's own `law_before`,
     which is compared at the joint before it. A chunk is filtered again from the state in which the chunk before it
     ends, and the first one from its state in `states`.
+
+    Args:
+        smooth: smooths some chunks from their first states, and from the smoothed laws after them.
+        states: states with which the chunks began (chunks, ...).
+        results: results of all chunks (chunks, ...).
     """
     laws_at_ends, laws_at_starts = take(results.law_after, slice(None, -1)), take(results.law_before, slice(1, None))
     disagrees_with_next = ~find_equal_states(laws_at_ends, laws_at_starts)

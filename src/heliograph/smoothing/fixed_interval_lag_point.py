@@ -74,7 +74,11 @@ def nis_test(sums: Float[np.ndarray, "5"]) -> tuple[float, float]:
 def warn_if_inconsistent(name: str, sums: Float[np.ndarray, "5"]) -> None:
     """Warn if a filter's squared innovations (NIS) are more than EXCESS times what its model predicts, beyond chance.
 
-    `sums` are the results of `nis_sums`. An excess of up to DEVIATIONS standard errors may be chance.
+    An excess of up to DEVIATIONS standard errors may be chance.
+
+    Args:
+        name: what warns, such as "smoothing".
+        sums: the five sums that `nis_sums` returns.
     """
     ratio, error = nis_test(sums)
     if ratio > EXCESS and ratio - 1 > DEVIATIONS * error:

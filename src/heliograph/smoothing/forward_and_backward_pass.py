@@ -170,6 +170,10 @@ def smooth_fixed_point(steps: SmootherStep, step: int) -> Estimate:
     """Estimate the state x_j after the step number j = `step`, given the data up to it, and up to each later step.
 
     Returns the stacked estimates, one for each of these ends of the data.
+
+    Args:
+        steps: the filter's smoother steps, stacked along time.
+        step: number j of the step.
     """
     fixed_step = take_step(steps, step)
 

@@ -57,7 +57,14 @@ def simulation_smoother(
 
 @compile_in_float64
 def _draw_paths(filter: AbstractFilter, z: Array, u: Array, keys: jax.Array) -> jax.Array:
-    """Draw one path of the states for each key (draws, steps, n): one filter pass, then a pass back for each draw."""
+    """Draw one path of the states for each key (draws, steps, n): one filter pass, then a pass back for each draw.
+
+    Args:
+        filter: the filter.
+        z: measurements (steps, received), NaN where nothing arrived.
+        u: inputs (steps, inputs).
+        keys: a random key for each path (draws,).
+    """
     first_step = np.asarray(0)
     _, steps = filter_rows_with_smoother_steps(filter, z, u, filter.init(), first_step)
     if steps.before is None:  # no single regression of a state on the next, as with several modes

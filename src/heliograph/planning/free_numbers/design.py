@@ -97,7 +97,12 @@ def design_numbers(task: DesignProblem, build: Build) -> PowerDesign:
 
 
 def _limit_all_powers(problem: FreeNumberProblem, budget: object) -> PowerLimits:
-    """Return the limits that a budget sets to the powers of all transmitters (steps, hops), or none without budget."""
+    """Return the limits that a budget sets to the powers of all transmitters (steps, hops), or none without budget.
+
+    Args:
+        problem: the network as a function of free numbers; names its transmitters.
+        budget: the budget, a number for the total power, or None.
+    """
     steps, hops = problem.error.steps, len(problem.names)
     if budget is None:
         return make_unlimited(steps, hops)
@@ -114,6 +119,10 @@ def _make_limit_rows(allowed: PowerLimits, target: float | None) -> PowerAndErro
 
     Peaks are limits like others here, since powers are not the free numbers. A row of a peak is one power divided by
     its peak, so that its limit is 1.
+
+    Args:
+        allowed: limits of the powers, infinite where there is none.
+        target: the target error, or None.
     """
     rows, most = allowed.make_limit_rows()
     peaks = allowed.peak.ravel()
@@ -131,8 +140,13 @@ def _make_limit_rows(allowed: PowerLimits, target: float | None) -> PowerAndErro
 def _make_unmet_limits_error(problem: DescentProblem, limits: PowerAndErrorLimits, begin: list[Vector]) -> ValueError:
     """Return the error for limits that no start meets: it names the least error within them, or the least power.
 
-    `begin`: the starts that were tried. A programme's `size` is the minimised number at its start, here at the best
+    A programme's `size` is the minimised number at its start, here at the best
     point that a search found.
+
+    Args:
+        problem: the function of the free numbers that is minimised.
+        limits: the limits that no start meets.
+        begin: the starts that were tried.
     """
     starts, sharpest = len(begin), problem.sharpnesses[-1]
     # If the limits of power can be met, the target error cannot: find the least error within them.

@@ -79,6 +79,10 @@ def solve_riccati(system: ModeSystem, criterion: Criterion) -> ModeSolution:
     If `system.start` is None, the periodic steady state is solved for. Otherwise the recursion runs from this
     covariance. Rounding may make a covariance negative by the share NEARLY_STEADY of the largest entry.
 
+    Args:
+        system: the system of the filter at each step, by mode.
+        criterion: the number that a design makes small, of which L is the derivative.
+
     Raises:
         ValueError: an error that grows without limit.
     """
@@ -127,6 +131,10 @@ def _run_riccati(system: ModeSystem, X: Float[np.ndarray, "_ n n"]) -> tuple[Par
 
     X of a mode is its covariance times its probability. The argument X is that before the first step, for each mode, or
     one for all modes together if their chain has no memory.
+
+    Args:
+        system: the system of the filter at each step, by mode.
+        X: X before the first step (modes, n, n), or summed over the modes (1, n, n).
     """
     covariances, gains = [], []
     for k in range(len(system.law)):
@@ -140,6 +148,11 @@ def _update_riccati(system: ModeSystem, k: int, X: Float[np.ndarray, "_ n n"]) -
     """Return the best gains K (modes, n, m) of step k and X (modes, n, n) after it, from X before it.
 
     X of a mode is its covariance times the mode's probability (`system.law`), so the noises are weighted by it too.
+
+    Args:
+        system: the system of the filter at each step, by mode.
+        k: the step.
+        X: X before the step (modes, n, n), or summed over the modes (1, n, n).
     """
     law = system.law[k][:, None, None]
     predicted_X = JumpSystem(system.chain[k], system.transition[k], law * system.process[k]).step(X)
@@ -155,6 +168,10 @@ def _close_loop(system: ModeSystem, gains: Numbers) -> JumpSystem:
     X_j = E[e e' 1{mode j}] is the covariance of the error e times the probability of mode j. F = (I - K H) A and
     S = pi [(I - K H) Q (I - K H)' + K N K'], with pi (`system.law`) the probability of each mode, H (`system.output`),
     and Q and N the covariances of process and measurement noise. All are by step; K, H, N, F and S also by mode.
+
+    Args:
+        system: the system of the filter at each step, by mode.
+        gains: K (steps, modes, n, m).
     """
     K, law = gains, system.law[:, :, None, None]  # K (steps, modes, n, m); law: pi (steps, modes, 1, 1)
     I_KH = np.eye(K.shape[2]) - K @ system.output  # I - K H
@@ -168,6 +185,10 @@ def lagrangian(system: ModeSystem, solution: ModeSolution) -> jax.Array:
 
     X_k,j is the error covariance after step k in mode j, times the mode's probability. R_k,j is the right side of its
     recursion X_k,j = R_k,j(X_k-1) under the gains K. L is the adjoint: the derivative of the error by each X.
+
+    Args:
+        system: the system of the filter at each step, by mode; JAX differentiates by its arrays.
+        solution: X, K and L, which are held fixed.
     """
     X, gains, adjoint = (jnp.asarray(values) for values in solution)
     X_before = jnp.roll(X, 1, axis=0)  # in a period, the last step leads to the first

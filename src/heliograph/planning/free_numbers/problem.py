@@ -286,6 +286,11 @@ class FreeNumberProblem:
 
         If a mean gain is uncertain, the scalar of Young's inequality, which bounds the error, becomes one more free
         number, and `young` is True.
+
+        Args:
+            build: function that returns the network, with the free numbers as keyword arguments.
+            numbers: the free numbers, with their starts and ranges.
+            error: the error that is to be small.
         """
         self.build, self.numbers, self.error, self.young = build, numbers, error, False
         network = self.network(numbers.start)
@@ -333,6 +338,10 @@ class FreeNumberProblem:
     def solve_at(self, x: Vector, criterion: Criterion | None = None) -> EvaluatedPoint:
         """Return system, solution and derivatives at x, for a criterion (that of the problem unless given).
 
+        Args:
+            x: values of all free numbers, as one vector.
+            criterion: the criterion, such as one that is smoothed more.
+
         Raises:
             ValueError: an error that grows without limit, powers that do.
         """
@@ -353,7 +362,9 @@ class FreeNumberProblem:
     def evaluate(self, x: Vector, sharpness: int | None) -> Evaluation | None:
         """Return the error, the powers and their derivatives, or None if error or powers grow without limit.
 
-        `sharpness`: q in tr(S^q)^(1/q), which stands for the largest eigenvalue; None for the trace.
+        Args:
+            x: values of all free numbers, as one vector.
+            sharpness: q in tr(S^q)^(1/q), which stands for the largest eigenvalue; None for the trace.
         """
         try:
             point = self.solve_at(x, self.criterion._replace(sharpness=sharpness))

@@ -338,9 +338,8 @@ def _compute_steps_reception(
 ) -> _StepsReception:
     """Return H (time, M, m, n), N (time, M, m, m) and powers (time, hops) over steps with one sensor and channel.
 
-    A planner finds the error for given powers of transmitters; the channel has M modes that the receiver observes, such
-    as arrived and lost. H is the mean map from state to what arrives in each mode, N the covariance of its noise, which
-    depends on the second moment of the state if gains are random.
+    The channel has M modes that the receiver observes, such as arrived and lost. H is the mean map from state to what
+    arrives in each mode, N the covariance of its noise, which depends on the state's second moment for random gains.
 
     Args:
         sensor: the sensor, with m outputs.
@@ -380,6 +379,13 @@ def _compute_mode_reception(
     the sensor's noise and Spread = E[dG Y dG'] the noise that the random part dG of (gain, offset) makes, given
     Y = E (y, 1)(y, 1)' (`y`) at each step. If M is uncertain (`young`: a scalar b > 0 for each step), N =
     Spread + Shift / b + (1 + b) M R M', with Shift the bound of what the error of M makes. Lost outputs: H = 0, N = 1.
+
+    Args:
+        channel: the channel in this mode, without memory.
+        arrived: which outputs arrive in it (m,).
+        y: E (y, 1)(y, 1)' of what the sensor measures at each step (time, m1, m1).
+        sensor: the sensor.
+        young: b at each step (time,), or None.
     """
     moments, present = second_order(channel), jnp.asarray(arrived)
     gain = jnp.where(present[:, None], jnp.asarray(moments.mean_gain), 0.0)

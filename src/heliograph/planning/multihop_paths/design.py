@@ -85,7 +85,12 @@ def find_least_total_powers(task: PowerTask, target: float) -> tuple[Powers, Cer
 def _find_least_powers(problem: PathProblem, starts: list[Powers], target: float) -> Powers | None:
     """Return the powers of least total that reach a target, by descents from the starts, or None if none can.
 
-    Each start is raised until it reaches the target. `scale`: the size of powers, which sets the steps of the search.
+    Each start is raised until it reaches the target.
+
+    Args:
+        problem: the error as a function of the free powers.
+        starts: powers at which searches begin, (time, free) each.
+        target: the target error.
     """
     no_power = np.zeros_like(starts[0])
     if problem.criterion.smooth(problem.covariances(no_power)).value <= target:
@@ -103,6 +108,11 @@ def _raise_powers(problem: PathProblem, start: Powers, target: float) -> Powers 
 
     The powers are cut to their limits. The factor is found by bisection of its logarithm between the two FACTORS, 1e-12
     and 1e12, as the error falls with the powers.
+
+    Args:
+        problem: the error as a function of the free powers, with their limits.
+        start: powers that are raised or lowered (time, free).
+        target: the target error.
     """
 
     def reaches(factor: float) -> bool:
@@ -120,7 +130,12 @@ def _raise_powers(problem: PathProblem, start: Powers, target: float) -> Powers 
 
 
 def _check_reachable(task: PowerTask, target: float) -> None:
-    """Raise ValueError unless the target exceeds, by the share REACHED, the error that all allowed power leaves."""
+    """Raise ValueError unless the target exceeds, by the share REACHED, the error that all allowed power leaves.
+
+    Args:
+        task: the error, the free hops and the limits of their powers.
+        target: the target error.
+    """
     limits, alpha = task.problem.limits, task.problem.paths.alpha[:, task.free]
     has_limits = np.any(np.isfinite(limits.peak)) or np.any(np.isfinite(limits.mean))
     # Each may send up to its peak, up to its mean power of all steps in one, and at most a lot of power (UNLIMITED).

@@ -85,6 +85,10 @@ def solve_fixed_point(step: RiccatiMap) -> Float[np.ndarray, "n n"]:
 def compute_covariances(plants: PlantSteps, information: Matrices) -> Matrices:
     """Return the posterior covariance P_k of each step (time, n, n) under the information J_k received at each step.
 
+    Args:
+        plants: A and Q of each step, and the covariance before the first, if any.
+        information: J_k (time, n, n).
+
     Raises:
         ValueError: steps that repeat for ever, under which the error grows without limit.
     """
@@ -109,7 +113,11 @@ def compute_covariances(plants: PlantSteps, information: Matrices) -> Matrices:
 def compute_adjoint(plants: PlantSteps, information: Matrices, p: Matrices, weights: Matrices) -> Matrices:
     """Return the adjoint L_k (time, n, n): the gradient of the cost by P_k, through P_k itself and all later steps.
 
-    `information`: J_k. `p`: P_k. `weights`: the derivative W_k of the cost by P_k alone. All are (time, n, n).
+    Args:
+        plants: A and Q of each step.
+        information: J_k, the information received at each step (time, n, n).
+        p: P_k, the error covariance after each step (time, n, n).
+        weights: W_k, the derivative of the cost by P_k alone (time, n, n).
     """
     # From step to step the filter's error is multiplied by phi, and its covariance moves by X+ = phi X phi'.
     phi = (np.eye(p.shape[-1]) - p @ information) @ plants.transition
@@ -264,6 +272,10 @@ def _arrange_by_position(
     """Return the values of hops as (time, path, position along the path), and the position of each hop on its path.
 
     Where a path is shorter than the longest, the value is 1.
+
+    Args:
+        paths: the paths, each a chain of hops.
+        values: a number of each hop at each step (time, hop).
     """
     order = np.argsort(paths.path, kind="stable")
     hop_counts = np.bincount(paths.path, minlength=paths.second.shape[1])
@@ -276,7 +288,12 @@ def _arrange_by_position(
 
 
 def share_of_signal(powers: Powers, alpha: Powers) -> Powers:
-    """Return the share of signal p / (p + alpha) in what each hop delivers (time, hop), with alpha in sent power."""
+    """Return the share of signal p / (p + alpha) in what each hop delivers (time, hop), with alpha in sent power.
+
+    Args:
+        powers: what each hop sends, p (time, hop).
+        alpha: noise of each hop in units of sent power (time, hop).
+    """
     total = powers + alpha
     # A hop without noise and power has the share 1: without noise any power will do.
     return np.asarray(np.divide(powers, total, out=np.ones_like(powers), where=total > 0))

@@ -280,8 +280,13 @@ def _make_paths_of_step(nodes: Mapping[str, Node], k: int, state: Float[np.ndarr
 def _check_uncorrelated(name: str, rows: Float[np.ndarray, "path m"], covariance: Float[np.ndarray, "m m"]) -> None:
     """Raise ValueError if two paths of a node carry correlated noise of its sensor.
 
-    `rows`: the combination of outputs that each path carries. `covariance`: of the sensor's noise. A correlation up to
+    A correlation up to
     UNCORRELATED counts as rounding.
+
+    Args:
+        name: name of the node, for messages.
+        rows: the combination of outputs that each path carries (path, m).
+        covariance: covariance of the sensor's noise (m, m).
     """
     path_covariance = rows @ covariance @ rows.T
     variances = np.diag(path_covariance)

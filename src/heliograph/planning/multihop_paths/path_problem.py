@@ -264,6 +264,10 @@ def _choose_total(limits: PowerLimits, paths: Paths) -> float:
     """Return the total power of starts if no total is given: the sum over transmitters of what each may send.
 
     Its limits are of peak and mean. Without any it is ten times the largest alpha, where half of what arrives is noise.
+
+    Args:
+        limits: limits of the free powers.
+        paths: the paths, for the noise of their hops (`alpha`, in units of sent power).
     """
     largest_means = np.minimum(limits.peak.mean(axis=0), limits.mean)  # of each transmitter
     without_limit = 10 * max(paths.alpha.max(), np.finfo(float).tiny)
@@ -274,7 +278,13 @@ def choose_supports(path: Int[np.ndarray, "free"], steps: int, starts: int, seed
     """Return a mask (steps, free) for each start of a search: which free hops send power at which step.
 
     In the first all hops send. In each other one some whole paths send at each step: every choice if there are at most
-    `starts`, else random ones. A convex problem needs the first only. `path`: number of the path of each free hop.
+    `starts`, else random ones. A convex problem needs the first only.
+
+    Args:
+        path: number of the path of each free hop (free,).
+        steps: number of steps.
+        starts: largest number of masks.
+        seed: of the choices that are drawn.
     """
     whole = np.ones((steps, len(path)), dtype=bool)
     if is_convex(path):

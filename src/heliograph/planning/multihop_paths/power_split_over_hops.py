@@ -157,7 +157,11 @@ def _find_multiplier(alpha: Hops, power: np.ndarray) -> np.ndarray:
     """Return log l of each path (time, path, 1), with the multiplier l at which sum_h p_h(l) is the path's power P.
 
     Newton's method is applied to log sum_h p_h as a function of log l. It starts at l = (sum_h sqrt(alpha_h) / P)^2,
-    which is exact for large P. `power`: P > 0 (time, path, 1).
+    which is exact for large P.
+
+    Args:
+        alpha: noise of each hop in units of sent power (time, path, hop), 0 where a path has fewer.
+        power: P > 0 of each path (time, path, 1).
     """
     has_hops = (alpha > 0).any(axis=-1, keepdims=True)
     log_l: np.ndarray = 2 * np.log(np.where(has_hops, np.sqrt(alpha).sum(axis=-1, keepdims=True), 1.0) / power)
@@ -178,6 +182,10 @@ def _split_at_multiplier(alpha: np.ndarray, log_l: np.ndarray) -> tuple[np.ndarr
 
     p_h = 2 (alpha / l) / (root + alpha) with root = sqrt(alpha^2 + 4 alpha / l). This equals (root - alpha) / 2, but
     loses no digits by cancellation.
+
+    Args:
+        alpha: noise of each hop in units of sent power (time, path, hop), 0 where a path has fewer.
+        log_l: logarithm of the multiplier l of each path (time, path, 1).
     """
     inverse = np.exp(-log_l)
     root = np.sqrt(alpha**2 + 4 * alpha * inverse)
@@ -218,6 +226,10 @@ def compute_envelope(whole: SplitPaths, cap: PathValues) -> Envelope:
     the noise of its hops and p_h their powers. The best split of P = sum_h p_h has one multiplier l, dD/dP = -D l. With
     several hops j is S-shaped, and the envelope begins with a ray from 0. It touches j where j = P dj/dP, which is
     D (1 - P l) = t: found by bisection in log l, as the left side falls with l.
+
+    Args:
+        whole: the paths, as functions of the power that their free hops send together.
+        cap: largest power of each path (time, path).
     """
     alpha, hops = whole.alpha, (whole.alpha > 0).sum(axis=-1)
     largest = np.where(hops > 0, alpha.max(axis=-1), 1.0)
