@@ -172,7 +172,17 @@ def _smooth_all(recursion: SmootherStepRecursion, chunk_starts: ChunkStarts, row
     # the chunk before it ends. Then from the last one back: each chunk whose smoothed law at its end is wrong.
     rescan_wrong_starts(smooth_chunks_from, chunk_starts.states, lambda results: results.end, results)
     _resmooth_wrong_ends(smooth_chunks_from, chunk_starts.states, results)
-    leaves = results.estimate, results.nis, results.received  # (chunks, own, ...) each
+    return _join_chunks(results, total)
+
+
+def _join_chunks(results: SmoothedChunk, total: int) -> SmoothedRows:
+    """Return the smoothed rows of all chunks, one after the other, without those that fill up the last chunk.
+
+    Args:
+        results: results of all chunks, with arrays (chunks, own, ...).
+        total: number of rows of the recording.
+    """
+    leaves = results.estimate, results.nis, results.received
     estimate, nis, received = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:total], leaves)
     return SmoothedRows(estimate, np.asarray(sum_nis_over_blocks(nis, received)))
 
