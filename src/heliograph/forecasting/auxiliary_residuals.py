@@ -18,8 +18,8 @@ from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.noises.noise import Gaussian
 
-FALSE = 0.01  # probability of any false shock, of all tests together
-EQUAL = 1e-10  # relative: means and covariances of what is measured and of what arrives that are the same
+FALSE_SHOCK = 0.01  # probability of any false shock, of all tests together
+RELATIVE_ROUNDING = 1e-10  # relative: means and covariances of what is measured and of what arrives that are the same
 ROUNDING = 1e-12  # of a variance, below which nothing is known of a noise
 
 
@@ -82,7 +82,7 @@ class Disturbances:
         residuals: np.ndarray = self.state_noise / self.state_deviation
         return residuals
 
-    def shocks(self, false: float = FALSE) -> list[Shock]:
+    def shocks(self, false: float = FALSE_SHOCK) -> list[Shock]:
         """List the breaks of states and the outliers of outputs in the order of their rows.
 
         Each residual is a test. A break also makes residuals of outputs large, an outlier also those of states, and
@@ -186,13 +186,13 @@ def _require_linear_model(filter: AbstractFilter) -> tuple[LinearPlant, LinearSe
 def _is_received_unchanged(predicted: Forecast) -> bool:
     """Return whether what arrives is predicted as what is measured, as if the channel hands it on unchanged.
 
-    EQUAL: the largest relative difference that counts as rounding.
+    RELATIVE_ROUNDING: the largest relative difference that counts as rounding.
     """
     measured, received = predicted.outputs, predicted.received
     if measured is None or received is None or measured.mean.shape != received.mean.shape:
         return False
-    has_same_covariance = np.allclose(measured.covariance, received.covariance, rtol=EQUAL, atol=0)
-    return has_same_covariance and np.allclose(measured.mean, received.mean, rtol=EQUAL, atol=1e-300)
+    has_same_covariance = np.allclose(measured.covariance, received.covariance, rtol=RELATIVE_ROUNDING, atol=0)
+    return has_same_covariance and np.allclose(measured.mean, received.mean, rtol=RELATIVE_ROUNDING, atol=1e-300)
 
 
 def _smooth_noises(

@@ -350,12 +350,14 @@ def _score_number(
         is_angle: whether it is an angle.
     """
     # The forecasts that count, and the values that came `horizon` rows later.
-    law, came = MixtureLaws(*(part[first:-horizon] for part in law)), values[first + horizon :]
+    law = MixtureLaws(*(part[first:-horizon] for part in law))
+    came = values[first + horizon :]
     # An angle is taken within half a turn of its forecast.
     came = law.mean + wrap_angles((came - law.mean)[:, None], (0,) if is_angle else ())[:, 0]
     # Nothing was forecast yet where the start is unknown (infinite variances).
     came = np.where(np.isfinite(law.variances).all(axis=1), came, np.nan)
-    error, probability_below = came - law.mean, compute_probability_below(law, came)
+    error = came - law.mean
+    probability_below = compute_probability_below(law, came)  # P(X < value)
     nan_if_absent = np.where(np.isnan(error), np.nan, 0.0)  # added to 0 or 1, so that absent rows do not count
     # A value that the forecast knows for certain is within any interval, so it does not test the share within.
     nan_if_untested = np.where(is_known_and_came(law, came), np.nan, nan_if_absent)

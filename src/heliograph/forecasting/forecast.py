@@ -9,23 +9,21 @@ import numpy as np
 from heliograph.factors.factored_gaussian import from_covariance
 from heliograph.filters.base import AbstractFilter, FilterAngles
 from heliograph.filters.gaussian.gaussian_prediction import open_loop_filter
+from heliograph.filters.wrappers.sensor_inputs import FilterOfInputs
+from heliograph.filters.wrappers.state_limits import LimitedFilter
+from heliograph.filters.wrappers.told_link_law import ToldFilter
 from heliograph.forecasting.forecast_result import Forecast, InputsAhead
 from heliograph.forecasting.horizons import Horizons, Inputs, RowsAhead, check_inputs_ahead, find_rows_ahead
 from heliograph.forecasting.mixture_moments import Moments, make_prediction
-from heliograph.forecasting.multistep_prediction import (
-    MultistepPredictor,
-    find_output_claim,
-    find_received_claim,
-    make_multistep_predictor,
-)
+from heliograph.forecasting.multistep_prediction import MultistepPredictor, make_multistep_predictor
 from heliograph.forecasting.predicted_moments import predict_moments, predict_moments_of_each
 from heliograph.forecasting.start_states import Sources, find_common_origin
 from heliograph.model.augmented.joint_sensors import joint_sensor
-from heliograph.model.estimate import Estimate, weakest
+from heliograph.model.estimate import Claim, Estimate, weakest
 from heliograph.model.forecast_origin import Origin
 from heliograph.model.over_time import first
 from heliograph.model.plant import LinearPlant
-from heliograph.model.sensor import AbstractSensor, AnySensor
+from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.types import PyTree
@@ -294,10 +292,10 @@ def combine_predictions(
     # Each prediction gets its own claim, and its angles between -pi and pi.
     predicted_outputs = predicted_received = None
     if outputs is not None:
-        output_claim = find_output_claim(filter, predictor)
+        output_claim = _find_output_claim(filter, predictor)
         predicted_outputs = make_prediction(outputs, tuple(sensor.outputs), output_claim, sensor.angles)
     if received is not None:
-        received_claim = find_received_claim(filter)
+        received_claim = _find_received_claim(filter)
         predicted_received = make_prediction(received, received_names, received_claim, angles.received)
     return Forecast(
         steps=steps,
@@ -307,3 +305,32 @@ def combine_predictions(
         received=predicted_received,
         inputs=inputs,
     )
+
+
+def _find_output_claim(filter: AbstractFilter, predictor: MultistepPredictor) -> Claim:
+    """Return the claim of the predicted outputs: what their covariance is said to be.
+
+    It is that of the filter, "exact", "upper", "nominal" or "none". Moments through a nonlinear sensor, and those of
+    angles, are approximate: the claim is at most "nominal" then.
+
+    Args:
+        filter: the filter.
+        predictor: predicts its states and outputs; has the sensor.
+    """
+    sensor = first(predictor.sensor)
+    is_exact = isinstance(sensor, LinearSensor) and not sensor.circular
+    return filter.claim if is_exact or filter.claim == "none" else weakest([filter.claim, "nominal"])
+
+
+def _find_received_claim(filter: AbstractFilter) -> Claim:
+    """Return the claim of what is predicted to arrive: the filter's, or "nominal" if example numbers stand for unknown.
+
+    A `ToldFilter` receives numbers with each message that determine the link's law, such as a noise variance. They are
+    not known ahead. Unless their own law is known, an example of them is used, with which the covariance is nominal.
+    """
+    base = filter
+    while isinstance(base, LimitedFilter | FilterOfInputs):
+        base = base.base
+    if isinstance(base, ToldFilter) and not base.knows_law_of_numbers and filter.claim != "none":
+        return weakest([filter.claim, "nominal"])
+    return filter.claim

@@ -13,7 +13,7 @@ from heliograph.numerics.check import array, fail, is_whole, scalar, show_value
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
 
-HALVINGS = 80  # of a bracket of a quantile: from some deviations to the last digit
+BISECTIONS = 80  # of a bracket of a quantile: from some deviations to the last digit
 Array = TypeAliasType("Array", np.ndarray)
 InputsAhead: TypeAlias = Literal["none", "given", "held"]
 
@@ -74,7 +74,7 @@ class Prediction:
             quantiles = np.clip(means + ndtri(probabilities) * deviations, low_end, high_end)  # of each part
         # The mixture's lies between the least and the greatest of its parts': halve that interval.
         low, high = quantiles.min(axis=-2), quantiles.max(axis=-2)
-        for _ in range(HALVINGS if means.shape[-2] > 1 else 0):
+        for _ in range(BISECTIONS if means.shape[-2] > 1 else 0):
             middle = (low + high) / 2
             is_below = self._find_probability_below(middle) < p
             low, high = np.where(is_below, middle, low), np.where(is_below, high, middle)

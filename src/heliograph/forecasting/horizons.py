@@ -18,11 +18,11 @@ from heliograph.numerics.types import ArrayLike, Float, units_in
 Horizon = int | float | timedelta | datetime | np.timedelta64 | np.datetime64
 Horizons = TypeAliasType("Horizons", Horizon | Sequence[Horizon] | np.ndarray)
 Inputs = TypeAliasType("Inputs", ArrayLike | Literal["held"] | None)  # rows ahead
-SECOND = 1e9  # nanoseconds
-MONTHS = {"Y": 12, "M": 1}  # in NumPy's units of time that have no length in seconds
-OFF = 0.25  # of a step: months and years differ by less from the usual one
-LONGEST = 1_000_000  # steps ahead
-FARTHEST = 1e15  # seconds, 30 million years: further than any date, and held by 64 bits
+NANOSECONDS = 1e9  # nanoseconds
+MONTHS_OF_UNIT = {"Y": 12, "M": 1}  # in NumPy's units of time that have no length in seconds
+LARGEST_MISFIT = 0.25  # of a step: months and years differ by less from the usual one
+MOST_STEPS_AHEAD = 1_000_000  # steps ahead
+MOST_SECONDS_AHEAD = 1e15  # seconds, 30 million years: further than any date, and held by 64 bits
 
 
 @runtime_checkable
@@ -124,7 +124,7 @@ def _convert_horizon_to_steps(origin: Origin, horizon: object) -> float:
     if not origin.spacing > 0:
         raise fail("horizons", "numbers of steps, where the time between them is not known", show_value(horizon))
     count = seconds / origin.spacing
-    if abs(count - round(count)) > OFF:
+    if abs(count - round(count)) > LARGEST_MISFIT:
         expected = f"whole steps of {origin.spacing:g} s"
         raise fail("horizons", expected, f"{show_value(horizon)}, {count:.4g} steps ahead")
     return float(round(count))
@@ -139,7 +139,7 @@ def _count_months(origin: Origin, horizon: object) -> int | None:
     """
     if isinstance(horizon, np.timedelta64):
         unit, size = np.datetime_data(horizon)
-        return int(horizon.astype(np.int64)) * size * MONTHS[unit] if unit in MONTHS else None
+        return int(horizon.astype(np.int64)) * size * MONTHS_OF_UNIT[unit] if unit in MONTHS_OF_UNIT else None
     if not isinstance(horizon, datetime | np.datetime64):
         return None
     date, end = _read_date_ahead(origin, horizon)
@@ -167,10 +167,10 @@ def _convert_to_times(origin: Origin, horizons: Horizons) -> np.ndarray:
 
 
 def _require_step_count(value: object) -> int:
-    """Return a number of steps ahead; raise ValueError if it is above LONGEST, a million."""
+    """Return a number of steps ahead; raise ValueError if it is above MOST_STEPS_AHEAD, a million."""
     count = check_count("horizons", value)
-    if count > LONGEST:
-        raise fail("horizons", f"at most {LONGEST:,} steps", count)
+    if count > MOST_STEPS_AHEAD:
+        raise fail("horizons", f"at most {MOST_STEPS_AHEAD:,} steps", count)
     return count
 
 
@@ -202,7 +202,7 @@ def _convert_to_seconds(origin: Origin, horizon: object) -> float | None:
         return None
     date, end = _read_date_ahead(origin, horizon)
     # As Python's integers: 64 bits of nanoseconds hold dates of six centuries, but spans of three.
-    return (int(date.astype(np.int64)) - int(end.astype(np.int64))) / SECOND
+    return (int(date.astype(np.int64)) - int(end.astype(np.int64))) / NANOSECONDS
 
 
 def _read_date_ahead(origin: Origin, horizon: datetime | np.datetime64) -> tuple[np.datetime64, np.datetime64]:
@@ -226,7 +226,7 @@ def _convert_span_to_seconds(span: timedelta | np.timedelta64) -> float:
     if isinstance(span, timedelta):
         return span.total_seconds()
     unit, size = np.datetime_data(span)
-    if unit == "generic" or unit in MONTHS or np.isnat(span):
+    if unit == "generic" or unit in MONTHS_OF_UNIT or np.isnat(span):
         raise fail("horizons", "spans of weeks or shorter units: a month has no length in seconds", show_value(span))
     # Compute with Python's integers, since NumPy's would overflow.
     seconds = float(np.array(1, f"timedelta64[{unit}]") / np.timedelta64(1, "s"))
@@ -327,11 +327,11 @@ def _place_on_clock(origin: Origin, distances: np.ndarray, continuous: bool) -> 
         return np.full((*end.shape[:-1], len(distances)), np.datetime64("NaT", "ns"))
     # The result is in nanoseconds, which end in 2262. Whole seconds are added first, as in seconds no date overflows.
     # `check_dates` tests the sum with 2 s to spare, as the fractions of the end and of the distance are added last.
-    seconds = np.minimum(spacing * distances, FARTHEST)
+    seconds = np.minimum(spacing * distances, MOST_SECONDS_AHEAD)
     whole_seconds = np.floor(seconds)
     last_second, spare = end.astype("datetime64[s]"), np.timedelta64(2, "s")
     dates = last_second + whole_seconds.astype(np.int64).astype("timedelta64[s]")
     checked = check_dates("horizons", dates + spare) - spare
     fraction_of_end = end.astype("datetime64[ns]") - last_second
-    fraction = np.round(SECOND * (seconds - whole_seconds)).astype(np.int64).astype("timedelta64[ns]")
+    fraction = np.round(NANOSECONDS * (seconds - whole_seconds)).astype(np.int64).astype("timedelta64[ns]")
     return np.asarray(checked + fraction_of_end + fraction)

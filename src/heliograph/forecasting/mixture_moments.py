@@ -65,6 +65,24 @@ def has_branches(branches: GaussianBranches) -> bool:
     return int(np.shape(branches.mean)[1]) > 1
 
 
+def _compute_mean_and_covariance(
+    weights: np.ndarray, means: np.ndarray, covariances: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean m (..., m) and covariance P (..., m, m) of a mixture of K Gaussians.
+
+    m = sum_k w_k m_k and P = sum_k w_k (P_k + (m_k - m) (m_k - m)').
+
+    Args:
+        weights: w_k (..., K).
+        means: m_k (..., K, m).
+        covariances: P_k (..., K, m, m).
+    """
+    mean = np.einsum("...k,...km->...m", weights, means)
+    distances = means - mean[..., None, :]
+    within = np.einsum("...k,...kij->...ij", weights, covariances)
+    return mean, within + np.einsum("...k,...ki,...kj->...ij", weights, distances, distances)
+
+
 def make_prediction(
     moments: Moments, names: tuple[str, ...], claim: Claim, angles: Angles, limits: PlacedLimits = ()
 ) -> Prediction:
@@ -84,11 +102,7 @@ def make_prediction(
     weights, means, covariances = map(np.asarray, moments[:3])
     variances = np.maximum(np.diagonal(covariances, axis1=-2, axis2=-1), 0.0)
     means = wrap_near(means, means[..., :1, :], angles)  # within half a turn of the first part, to be averaged
-    # Moments of the mixture: mean = sum_k w_k m_k, covariance = sum_k w_k (P_k + (m_k - mean) (m_k - mean)').
-    mean = np.einsum("...k,...km->...m", weights, means)
-    distances = means - mean[..., None, :]
-    within = np.einsum("...k,...kij->...ij", weights, covariances)
-    covariance = within + np.einsum("...k,...ki,...kj->...ij", weights, distances, distances)
+    mean, covariance = _compute_mean_and_covariance(weights, means, covariances)
     if claim == "none":
         covariance, variances = np.full_like(covariance, np.nan), np.full_like(variances, np.nan)
     # The law of each number by itself: of these parts, or that in `laws`, whose variances count where one is known.

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.engine.choice import compile_on_call
+from heliograph.factors.covariance_factors import WeightedColumns
 from heliograph.factors.diffuse_gaussian import Diffuse, mark_unknown, project_diffuse
 from heliograph.factors.factored_gaussian import Gaussian, from_covariance, take_leading
 from heliograph.filters.base import AbstractFilter
@@ -28,11 +29,11 @@ from heliograph.filters.wrappers.sensor_inputs import FilterOfInputs
 from heliograph.filters.wrappers.state_limits import LimitedFilter
 from heliograph.filters.wrappers.told_link_law import ToldFilter
 from heliograph.forecasting.mixture_moments import MarginalLaws, Moments, has_branches, spread_over_branches
-from heliograph.model.estimate import Claim, Innovation, weakest
+from heliograph.model.estimate import Innovation
 from heliograph.model.fading import without_memory
 from heliograph.model.over_time import OverTime, at, at_each_step, first
-from heliograph.model.plant import AnyPlant
-from heliograph.model.sensor import AnySensor, LinearSensor
+from heliograph.model.plant import AbstractPlant, AnyPlant
+from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
 from heliograph.random_affine.memories_of_channels import memories
@@ -147,7 +148,7 @@ class MultistepPredictor(Module):
         if isinstance(filter, MultipleModelFilter) and memories((self.plant, self.sensor)):
             return _measure_in_each_mode(filter, prior_within_limits, k)
         # The models of step k; `under` gives the sensor for these inputs.
-        plant, initial_moments = at(self.plant, k), second_moments_at_start(self.plant)
+        plant = at(self.plant, k)
         sensor = at(self.sensor, k).under(plant.inputs, u)
         # Of a start that is not known yet some outputs have infinite variances; sensors are linear there.
         if isinstance(prior, Diffuse):
@@ -158,24 +159,42 @@ class MultistepPredictor(Module):
         if isinstance(self.filter, AdaptiveFilter):
             deviations = jnp.asarray(self.filter.noise_deviations(prior, k))
             learned_noise = sensor.noise.columns.through(jnp.diag(deviations))
-
-        def predict_outputs(mean: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array]:
-            """Return mean and covariance of the outputs from those of the states, for one component of the mixture.
-
-            `learned_noise` is the sensor's noise as the filter has learned it, or None.
-            """
-            states_law = from_covariance(mean, covariance)
-            signal = find_signal_moments(plant, sensor, self.transform, states_law, initial_moments, learned_noise)
-            return signal.mean, signal.covariance
-
-        means, covariances = jax.vmap(predict_outputs)(states.means, states.covariances)
-        outputs = Moments(states.weights, means, covariances)
+        initial_power = second_moments_at_start(self.plant)
+        outputs = self._measure_each_component(plant, sensor, states, initial_power, learned_noise)
         laws = self._find_output_laws(states, outputs, sensor.noise, deviations)
         # Student's law of at most two degrees has no variance.
+        covariances = outputs.covariances
         if isinstance(sensor.noise, StudentT):
             has_no_variance = jnp.full(len(sensor.outputs), jnp.asarray(sensor.noise.degrees) <= 2)
             covariances = jax.vmap(lambda covariance: mark_unknown(covariance, has_no_variance))(covariances)
         return outputs._replace(covariances=covariances, laws=laws)
+
+    def _measure_each_component(
+        self,
+        plant: AbstractPlant,
+        sensor: AbstractSensor,
+        states: Moments,
+        initial_power: jax.Array,
+        learned_noise: WeightedColumns | None,
+    ) -> Moments:
+        """Return the moments of the sensor's outputs, for each of K Gaussians of the states, with the same weights.
+
+        Args:
+            plant: the plant at this step.
+            sensor: the sensor at this step.
+            states: moments of the states: means (K, n) and covariances (K, n, n).
+            initial_power: E[x_i^2] of each state before any data (n,), by which rounding is judged.
+            learned_noise: the sensor's noise as the filter has learned it; None for that of the sensor.
+        """
+
+        def predict_outputs(mean: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array]:
+            """Return mean and covariance of the outputs from those of the states, for one Gaussian."""
+            states_law = from_covariance(mean, covariance)
+            signal = find_signal_moments(plant, sensor, self.transform, states_law, initial_power, learned_noise)
+            return signal.mean, signal.covariance
+
+        means, covariances = jax.vmap(predict_outputs)(states.means, states.covariances)
+        return Moments(states.weights, means, covariances)
 
     def _find_output_laws(
         self, states: Moments, outputs: Moments, noise: AbstractNoise, deviations: jax.Array | None
@@ -357,32 +376,3 @@ def _find_received_noise(filter: AbstractFilter) -> ReceivedNoise | OverTime | N
 def _compute_moments_now(predictor: MultistepPredictor, state: PyTree) -> Moments:
     """Return the moments of the plant's states in a filter's `state`, before they are conditioned on limits."""
     return predictor.compute_moments_before_limits(state)
-
-
-def find_output_claim(filter: AbstractFilter, predictor: MultistepPredictor) -> Claim:
-    """Return the claim of the predicted outputs: what their covariance is said to be.
-
-    It is that of the filter, "exact", "upper", "nominal" or "none". Moments through a nonlinear sensor, and those of
-    angles, are approximate: the claim is at most "nominal" then.
-
-    Args:
-        filter: the filter.
-        predictor: predicts its states and outputs; has the sensor.
-    """
-    sensor = first(predictor.sensor)
-    is_exact = isinstance(sensor, LinearSensor) and not sensor.circular
-    return filter.claim if is_exact or filter.claim == "none" else weakest([filter.claim, "nominal"])
-
-
-def find_received_claim(filter: AbstractFilter) -> Claim:
-    """Return the claim of what is predicted to arrive: the filter's, or "nominal" if example numbers stand for unknown.
-
-    A `ToldFilter` receives numbers with each message that determine the link's law, such as a noise variance. They are
-    not known ahead. Unless their own law is known, an example of them is used, with which the covariance is nominal.
-    """
-    base = filter
-    while isinstance(base, LimitedFilter | FilterOfInputs):
-        base = base.base
-    if isinstance(base, ToldFilter) and not base.knows_law_of_numbers and filter.claim != "none":
-        return weakest([filter.claim, "nominal"])
-    return filter.claim

@@ -98,7 +98,9 @@ def _make_forecast(predictor: MultistepPredictor, z: np.ndarray, u: np.ndarray, 
     """
     rows = np.arange(len(z)), z, u
     # Native code steps over the rows if it supports the filter, else JAX's compiler XLA.
-    _, moments = scan_rows(_begin, _predict_and_correct, predictor, rows, lambda: _by_xla(predictor, rows))
+    _, moments = scan_rows(
+        begin=_begin, step=_predict_and_correct, fixed=predictor, rows=rows, by_xla=lambda: _by_xla(predictor, rows)
+    )
     return combine_predictions(
         predictor,
         moments,

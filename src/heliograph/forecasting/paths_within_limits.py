@@ -36,6 +36,23 @@ class StateLimits(Module):
         return x
 
 
+def _draw_normal_within(
+    low: np.ndarray, high: np.ndarray, generator: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Draw standard normal numbers given that they lie within limits; return them and the probability of that (draws,).
+
+    They are values of the inverse distribution function, drawn uniformly between its values at the limits.
+
+    Args:
+        low: lower limits, in deviations from the mean (draws,); minus infinity where there is none.
+        high: upper limits, likewise.
+        generator: of the random numbers.
+    """
+    probability_below_low, probability_below_high = ndtr(low), ndtr(high)
+    probability_within = probability_below_high - probability_below_low
+    return ndtri(probability_below_low + generator.random(len(low)) * probability_within), probability_within
+
+
 def draw_limited_components(
     part: np.ndarray, means: np.ndarray, covariances: np.ndarray, limits: PlacedLimits, generator: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -64,15 +81,13 @@ def draw_limited_components(
     mean, P = means[part], covariances
     weight = np.ones(len(part))
     for i, low, high in limits:
-        # Draw the component by the inverse of its distribution function, between that function's values at the limits.
-        # A component without variance stays.
+        # Draw the component within its limits. One without variance stays.
         variance = P[:, i, i]
         is_random = variance > 0
         divisor = np.where(is_random, variance, 1.0)
         deviation = np.sqrt(divisor)[part]
-        probability_below_low, probability_below_high = (ndtr((end - mean[:, i]) / deviation) for end in (low, high))
-        probability_within = probability_below_high - probability_below_low
-        normal = ndtri(probability_below_low + generator.random(len(part)) * probability_within)
+        low_end, high_end = ((end - mean[:, i]) / deviation for end in (low, high))
+        normal, probability_within = _draw_normal_within(low_end, high_end, generator)
         moved = np.where(is_random[part], deviation * normal, 0.0)
         drawn = np.clip(mean[:, i] + moved, low, high)
         weight *= np.where(is_random[part], probability_within, 1.0)

@@ -10,7 +10,7 @@ from heliograph.forecasting.multistep_prediction import MultistepPredictor
 from heliograph.numerics.float64 import quickly_compiled, to_numpy
 from heliograph.numerics.types import PyTree
 
-BLOCK = 128  # plants side by side under XLA
+PLANTS_AT_ONCE = 128  # plants side by side under XLA
 
 
 def predict_moments(
@@ -29,7 +29,7 @@ def predict_moments(
     """
     arguments = predictor, state, np.asarray(u, dtype=float), np.asarray(step)
     # Native code computes `_predict_moments` if it supports the filter's operations; else JAX's compiler XLA does.
-    moments: tuple[Moments | None, ...] = compute_once(_predict_moments, _by_xla, arguments)
+    moments: tuple[Moments | None, ...] = compute_once(function=_predict_moments, by_xla=_by_xla, arguments=arguments)
     return moments
 
 
@@ -48,7 +48,9 @@ def predict_moments_of_each(
             return found
         # By XLA in blocks of one size, so that it compiles once. The last block is filled up with the last plant.
         count = len(u)
-        plants_of_blocks = [np.minimum(np.arange(i, i + BLOCK), count - 1) for i in range(0, count, BLOCK)]
+        plants_of_blocks = [
+            np.minimum(np.arange(i, i + PLANTS_AT_ONCE), count - 1) for i in range(0, count, PLANTS_AT_ONCE)
+        ]
         blocks = [
             to_numpy(_each_by_xla(predictor, *jax.tree.map(lambda leaf, plants=plants: leaf[plants], arguments)))
             for plants in plants_of_blocks

@@ -37,7 +37,11 @@ def roll_forecasts(
     windows = np.stack([padded[1 + i : 1 + i + len(u)] for i in range(longest)], axis=1)
     indices = np.asarray(horizons) - 1  # among the rows ahead; horizon 1 is the first of them
     arguments = predictor, z, u, windows, indices
-    rolled: tuple[Moments, Moments | None] = compute_once(_forecast_from_each_row, _by_xla, arguments)
+    # Native code computes `_forecast_from_each_row` if it supports the filter's operations; else JAX's compiler XLA
+    # does.
+    rolled: tuple[Moments, Moments | None] = compute_once(
+        function=_forecast_from_each_row, by_xla=_by_xla, arguments=arguments
+    )
     return rolled
 
 

@@ -132,6 +132,13 @@ def draw_paths(
     )
 
 
+class PathState(NamedTuple):
+    """Where a path is after a step: its state x, and its mode, 0 if plant and sensor have none; or of many paths."""
+
+    x: Any
+    mode: Any
+
+
 class ModeSwitching(NamedTuple):
     """How a path's mode moves: by the Markov chain of the filter's modes.
 
@@ -182,9 +189,7 @@ def _find_switching(target: ForecastTarget) -> ModeSwitching | None:
     return ModeSwitching(filter, target.state.moved)
 
 
-def _draw_initial_states(
-    target: ForecastTarget, draws: int, generator: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
+def _draw_initial_states(target: ForecastTarget, draws: int, generator: np.random.Generator) -> PathState:
     """Return states (draws, n) and modes (draws,) drawn from the last estimate, a mixture of K Gaussians.
 
     For each draw one Gaussian is drawn by its weight, and from it the mode and the state. The modes are 0 where the
@@ -218,14 +223,14 @@ def _draw_initial_states(
     roots = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
     changes = np.einsum("dij,dj->di", roots[part], generator.normal(size=(draws, means.shape[1])))
     drawn: np.ndarray = Manifold((), filter.attitude).settle(mean, mean + changes)
-    return drawn, modes
+    return PathState(x=drawn, mode=modes)
 
 
 @compile_in_float64
 def _draw_paths_from_states(
     plant: AnyPlant,
     sensor: AnySensor | None,
-    starts: tuple[Array, Array],
+    starts: PathState,
     u: Array,
     keys: jax.Array,
     step: Array,
@@ -238,7 +243,7 @@ def _draw_paths_from_states(
     Args:
         plant: of the paths.
         sensor: what measures them; None for none.
-        starts: state (draws, n) and mode (draws,) before the first row.
+        starts: states (draws, n) and modes (draws,) before the first row.
         u: inputs (rows, inputs).
         keys: a random key for each path (draws,).
         step: number of the first row.
@@ -248,12 +253,12 @@ def _draw_paths_from_states(
     """
 
     def draw_row(
-        before: tuple[jax.Array, jax.Array], row: tuple[jax.Array, jax.Array], key: jax.Array
-    ) -> tuple[Any, Any]:
-        """Draw row k of a path; return state and mode there, which the next row begins with, and state and output.
+        before: PathState, row: tuple[jax.Array, jax.Array], key: jax.Array
+    ) -> tuple[PathState, tuple[jax.Array, jax.Array]]:
+        """Draw row k of a path: return where the path is then, which the next row begins with, and state and output.
 
-        `plant` and `sensor` are the models of all rows, `switching` is how their modes move, `step` the number of the
-        first row.
+        `row` holds the inputs and the number k. The state moves by the plant, then noise is added; limits of states
+        hold after both.
         """
         (x, mode), (u_k, k) = before, row
         key_of_row = jax.random.fold_in(key, k)
@@ -265,15 +270,13 @@ def _draw_paths_from_states(
             plant_k, sensor_k = switching.choose_models(plant_k, sensor_k, mode)
         moved = limits.hold(plant_k.transition(x, u_k))
         x = limits.hold(limits.mirror(plant_k.plus(moved, plant_k.sample_noise(key_of_plant, u_k))))
-        if sensor_k is None:
-            return (x, mode), (x, jnp.zeros(0))
-        return (x, mode), (x, _draw_outputs(sensor_k.under(plant_k.inputs, u_k), x, key_of_sensor, learned))
+        y = jnp.zeros(0)
+        if sensor_k is not None:
+            y = _draw_outputs(sensor_k.under(plant_k.inputs, u_k), x, key_of_sensor, learned)
+        return PathState(x, mode), (x, y)
 
-    def draw_path(start: tuple[jax.Array, jax.Array], key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return the states (rows, n) and outputs (rows, m) of one path, drawn row by row from a state and a mode.
-
-        From outside: `u`, inputs of the rows, and `step`, number of the first row.
-        """
+    def draw_path(start: PathState, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return the states (rows, n) and outputs (rows, m) of one path, drawn row by row from its start."""
         rows = jnp.asarray(u), jnp.asarray(step) + jnp.arange(len(u))
         path: tuple[jax.Array, jax.Array]
         _, path = jax.lax.scan(lambda before, row: draw_row(before, row, key), start, rows)

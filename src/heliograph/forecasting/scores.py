@@ -169,14 +169,14 @@ def average_overlapping(values: np.ndarray, horizon: int) -> ScoreMean:
     one = came.astype(float)
     # E[d' W d] = tr(M W M S) with M = I - 1 1' / n over the rows that are not NaN, which `one` marks by ones:
     # tr(W S) + (1' W 1) (1' S 1) / n^2 - 2 / n 1' W S 1.
-    weights_of_rows, overlaps_of_rows = _weigh_neighbours(one, bartlett), _weigh_neighbours(one, overlap)
+    W_one, S_one = _weigh_neighbours(one, bartlett), _weigh_neighbours(one, overlap)
+    one_W_one, one_S_one = one @ W_one, one @ S_one
     shortest = min(len(bartlett), len(overlap))
-    expected = one @ _weigh_neighbours(one, bartlett[:shortest] * overlap[:shortest])
-    total_overlap = one @ overlaps_of_rows
-    expected += (one @ weights_of_rows) * total_overlap / n**2 - 2 / n * (weights_of_rows * one) @ overlaps_of_rows
+    expected = one @ _weigh_neighbours(one, bartlett[:shortest] * overlap[:shortest])  # tr(W S) = sum of W_ij S_ij
+    expected += one_W_one * one_S_one / n**2 - 2 / n * (W_one * one) @ S_one
     # d' W d (1' S 1) / E[d' W d]; over n^2 it is the squared standard error.
     d = np.where(came, values - mean, 0.0)
-    total = d @ _weigh_neighbours(d, bartlett) * total_overlap / expected
+    total = d @ _weigh_neighbours(d, bartlett) * one_S_one / expected
     return ScoreMean(mean, float(np.sqrt(np.maximum(total, 0.0)) / n))
 
 

@@ -13,7 +13,7 @@ from heliograph.numerics.process.optional_packages import check_installed
 if TYPE_CHECKING:  # an extra
     import xarray as xr
 
-BLOCK = 64  # draws whose rows are computed side by side
+DRAWS_AT_ONCE = 64  # draws whose rows are computed side by side
 METHOD: Method = "hessian"  # the curvature of the likelihood alone
 
 
@@ -49,7 +49,7 @@ def make_inference_data(solution: Solution, draws: int, seed: int) -> Any:
     covariance, _ = solution.covariance(METHOD)
     points = solution.x + random.multivariate_normal(np.zeros(len(solution.x)), covariance, draws, method="cholesky")
     density = np.concatenate(
-        [_evaluate_row_likelihoods(solution, points[k : k + BLOCK]) for k in range(0, draws, BLOCK)]
+        [_evaluate_row_likelihoods(solution, points[k : k + DRAWS_AT_ONCE]) for k in range(0, draws, DRAWS_AT_ONCE)]
     )
     groups = {
         "posterior": _make_posterior(solution, points),

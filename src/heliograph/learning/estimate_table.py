@@ -11,7 +11,7 @@ import numpy as np
 
 from heliograph.learning.estimate_row import Row, make_unidentified_row
 from heliograph.learning.free_parameters import Parameters, TableEntry
-from heliograph.learning.likelihood.multistart import FURTHER, HighestPoint
+from heliograph.learning.likelihood.multistart import WAY_TO_END, HighestPoint
 from heliograph.learning.likelihood.objective import Form
 from heliograph.learning.likelihood.parameter_transforms import (
     from_unconstrained,
@@ -20,7 +20,7 @@ from heliograph.learning.likelihood.parameter_transforms import (
 )
 from heliograph.learning.likelihood.surface import LikelihoodSurface
 from heliograph.learning.long_run_covariance import (
-    DRAWS,
+    BOOTSTRAP_DRAWS,
     LEVEL,
     Method,
     Scores,
@@ -35,10 +35,10 @@ from heliograph.learning.long_run_covariance import (
 from heliograph.learning.unidentified_directions import InformationRank, find_rank_of_late_rows
 from heliograph.numerics.types import Bool, Float
 
-WIDE = 1.0  # standard error of a logarithm or a logit above which an interval is cut out of the likelihood
-END = 40.0  # steps of a logarithm or a logit to what cannot be told from the end of its domain
-REAL_END = 1000.0  # times two standard errors, to where a real number's likelihood does not fall at all
-ALONG = 1e-5  # share of a number's derivative that may lie along a ridge
+WIDE_ERROR = 1.0  # standard error of a logarithm or a logit above which an interval is cut out of the likelihood
+FURTHEST_LOGARITHM = 40.0  # steps of a logarithm or a logit to what cannot be told from the end of its domain
+FURTHEST_REAL = 1000.0  # times two standard errors, to where a real number's likelihood does not fall at all
+LARGEST_SHARE_ALONG_RIDGE = 1e-5  # share of a number's derivative that may lie along a ridge
 
 
 @dataclass(frozen=True, repr=False)
@@ -271,9 +271,9 @@ class Solution:
         coordinate = entry.coordinate  # None of numbers of a simplex or a covariance, which have none of their own
         is_in_few_stretches = False
         if coordinate is not None:
-            hardly_known = self.surface.domains.single[coordinate] and error > WIDE
+            hardly_known = self.surface.domains.single[coordinate] and error > WIDE_ERROR
             if hardly_known or method == "profile":
-                first = min(error, WIDE) * np.array([-2.0, 2.0])  # where the search for either end begins
+                first = min(error, WIDE_ERROR) * np.array([-2.0, 2.0])  # where the search for either end begins
                 low, high = self._find_profile_ends(coordinate, first, find_profile_drop(level))
                 return low, high
             index_among_active = np.count_nonzero(self.active[:coordinate])
@@ -311,14 +311,15 @@ class Solution:
     def identifies(self, slopes: Float[np.ndarray, " active"]) -> bool:
         """Return whether the data identify a function f of the numbers: f does not change where l does not (ridges).
 
-        `slopes`: df/dx by the active coordinates x. Its component along ridges (`rank.flat`) is at most ALONG |df/dx|.
+        `slopes`: df/dx by the active coordinates x. Its component along ridges (`rank.flat`) is at most
+        LARGEST_SHARE_ALONG_RIDGE |df/dx|.
         """
         scaled_slopes = self.rank.unit * slopes  # in units of each coordinate's standard error
         size = np.linalg.norm(scaled_slopes)
-        return bool(size > 0 and np.linalg.norm(scaled_slopes @ self.rank.flat) <= ALONG * size)
+        return bool(size > 0 and np.linalg.norm(scaled_slopes @ self.rank.flat) <= LARGEST_SHARE_ALONG_RIDGE * size)
 
     def _bootstrap_interval(self, slopes: np.ndarray, level: float) -> np.ndarray:
-        """Return both ends of an interval, relative to the estimate, from DRAWS sums of blocks of scores drawn again.
+        """Return both ends of an interval, relative to the estimate, by a bootstrap of blocks of scores.
 
         A sum of scores moves the maximum by H^-1 times it.
 
@@ -326,7 +327,7 @@ class Solution:
             slopes: derivatives of the number's unconstrained coordinate by the active coordinates (active,).
             level: probability with which the interval holds the number.
         """
-        sums = bootstrap_block_sums([s @ self.basis for s in self.scores], draws=DRAWS, seed=0)
+        sums = bootstrap_block_sums([s @ self.basis for s in self.scores], draws=BOOTSTRAP_DRAWS, seed=0)
         moves = slopes @ self.basis @ np.linalg.solve(self.hessian, sums.T)
         return np.asarray(np.quantile(moves, [(1 - level) / 2, (1 + level) / 2]))
 
@@ -343,7 +344,7 @@ class Solution:
         """
         assert entry.coordinate is not None
         outward = self.top.ends[entry.coordinate]  # -1 or 1
-        first, drop = np.array([-outward * FURTHER]), find_profile_drop(2 * level - 1)
+        first, drop = np.array([-outward * WAY_TO_END]), find_profile_drop(2 * level - 1)
         (end,) = self._find_profile_ends(entry.coordinate, first, drop)
         limit = float(from_unconstrained(entry.domain, end if np.isfinite(end) else -outward * np.inf))
         return Row(
@@ -362,7 +363,7 @@ class Solution:
 
         `first` (sides,): signed distances from the maximum at which searches begin; they end at `furthest`.
         """
-        furthest = REAL_END * np.abs(first).max() if self.surface.domains.free[coordinate] else END
+        furthest = FURTHEST_REAL * np.abs(first).max() if self.surface.domains.free[coordinate] else FURTHEST_LOGARITHM
         return self.surface.find_profile_crossings(
             self.top.x, self.total, coordinate=coordinate, first=first, furthest=furthest, drop=drop, active=self.active
         )

@@ -12,7 +12,7 @@ from heliograph.learning.fit_result import Fit
 from heliograph.learning.identifiability import identify_by_recording
 from heliograph.learning.likelihood.climbs import ClimbEnds
 from heliograph.learning.likelihood.data import gather_data
-from heliograph.learning.likelihood.multistart import AWAY, SPREAD, MaximumSearch
+from heliograph.learning.likelihood.multistart import SPREAD_OF_LOGARITHMS, SPREAD_OF_REALS, MaximumSearch
 from heliograph.learning.likelihood.objective import make_objectives
 from heliograph.learning.likelihood.surface import LikelihoodSurface
 from heliograph.learning.packet_losses.delay_law import Delays, learn_delays
@@ -187,11 +187,12 @@ def _choose_starts(surface: LikelihoodSurface, count: int, seed: int) -> Float[n
         step = int(np.argmax(~np.isfinite(by_row)))
         expected = "numbers under which the recording is possible"
         raise fail("start of the fit", expected, f"a log-likelihood of {total} from step {step} on")
-    # Draw the others uniformly around it: logarithms and logits within SPREAD; real numbers within half their size or
-    # AWAY standard errors, whichever is more, or within SPREAD if both are 0 (no information gives no standard error).
+    # Draw the others uniformly around it: logarithms and logits within SPREAD_OF_LOGARITHMS; real numbers within half
+    # their size or SPREAD_OF_REALS standard errors, whichever is more, or within SPREAD_OF_LOGARITHMS if both are 0 (no
+    # information gives no standard error).
     free, deviation = surface.domains.free, surface.standard_errors(start)
-    far = np.maximum(np.abs(start) / 2, AWAY * np.where(np.isfinite(deviation), deviation, 0.0))
-    drawn = rng.uniform(-1, 1, (count - 1, len(start))) * np.where(free & (far > 0), far, SPREAD)
+    far = np.maximum(np.abs(start) / 2, SPREAD_OF_REALS * np.where(np.isfinite(deviation), deviation, 0.0))
+    drawn = rng.uniform(-1, 1, (count - 1, len(start))) * np.where(free & (far > 0), far, SPREAD_OF_LOGARITHMS)
     points = surface.move_to_finite_likelihood(start + np.concatenate([np.zeros((1, len(start))), drawn]), start)
     _require_information_on_each_number(surface, points)
     return points

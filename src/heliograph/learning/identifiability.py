@@ -15,7 +15,7 @@ from heliograph.learning.long_run_covariance import student_quantile
 from heliograph.learning.parametric_network import Build, describe
 from heliograph.learning.told_numbers import find_told_filter
 from heliograph.learning.unidentified_directions import (
-    WEAK,
+    WEAK_INFORMATION,
     ConfoundedNumbers,
     InformationRank,
     find_confounded,
@@ -37,8 +37,8 @@ from heliograph.random_affine.moments.second_moments import second_order
 if TYPE_CHECKING:
     from heliograph.learning.estimate_table import Solution
 
-POINTS = 3
-AROUND = 0.5  # how far from the start, in each coordinate
+POINTS_NEAR_START = 3
+LARGEST_DISTANCE = 0.5  # how far from the start, in each coordinate
 
 
 @readable
@@ -142,14 +142,16 @@ def identify_by_recording(surface: LikelihoodSurface, start: Float[np.ndarray, "
 
 
 def _draw_points_near(start: np.ndarray, seed: int) -> list[np.ndarray]:
-    """Return POINTS (3) points (p,) drawn near a start (p,), at most AROUND (0.5) away in each coordinate.
+    """Return three points (p,) drawn near a start (p,), at most LARGEST_DISTANCE (0.5) away in each coordinate.
 
     At the start itself numbers may be identified by chance, or not be, as where two of them are equal. Small
     coordinates are moved less.
     """
     rng = np.random.default_rng([seed, 1])
     reach = np.minimum(1.0, 0.2 + np.abs(start))
-    return [start + rng.uniform(-AROUND, AROUND, len(start)) * reach for _ in range(POINTS)]
+    return [
+        start + rng.uniform(-LARGEST_DISTANCE, LARGEST_DISTANCE, len(start)) * reach for _ in range(POINTS_NEAR_START)
+    ]
 
 
 def _judge_identifiability(
@@ -188,7 +190,7 @@ def describe_unidentified(identifiability: Identifiability, solution: "Solution 
     has_others = any(group.fix + len(group.exponents) < len(group.coordinates) for group in identifiability.groups)
     if solution is not None and has_others:
         lines += describe_identified_links(solution)
-    if identifiability.weakest < WEAK:
+    if identifiability.weakest < WEAK_INFORMATION:
         lines.append(
             f"The data hardly tell some of {', '.join(names)} apart (least eigenvalue {identifiability.weakest:.1g}): "
             "expect wide intervals."
@@ -322,7 +324,7 @@ def _draw_measurements_by_innovations(objective: Objective, x: Array, u: Array, 
 if TYPE_CHECKING:
     from heliograph.learning.estimate_table import Solution
 
-KINDS = ("mean gain", "gain variance", "noise")
+KINDS_OF_MOMENTS = ("mean gain", "gain variance", "noise")
 
 
 def describe_identified_links(solution: "Solution") -> list[str]:
@@ -361,7 +363,7 @@ def describe_identified_links(solution: "Solution") -> list[str]:
     lines = []
     for name, values, gradients in zip(names, moments, slopes, strict=True):
         found = []
-        for kind, value, gradient in zip(KINDS, values, gradients, strict=True):
+        for kind, value, gradient in zip(KINDS_OF_MOMENTS, values, gradients, strict=True):
             if solution.identifies(gradient):
                 reach = student_quantile(freedom) * float(np.sqrt(max(gradient @ covariance @ gradient, 0.0)))
                 found.append(f"{kind} {value:.3g} ({value - reach:.3g} .. {value + reach:.3g})")

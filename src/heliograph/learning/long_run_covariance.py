@@ -34,8 +34,10 @@ def estimate_mean_and_error(values: Float[np.ndarray, " steps"]) -> tuple[float,
 Method = Literal["cosines", "bartlett", "white", "hessian", "bootstrap", "profile"]
 METHODS = get_args(Method)
 LEVEL = 0.95
-DRAWS = 999  # of the bootstrap
-FEW = 1 / 3  # share of the data in which the information on a number lies, below which scores do not tell its spread
+BOOTSTRAP_DRAWS = 999  # of the bootstrap
+FEW_STRETCHES = (
+    1 / 3
+)  # share of the data in which the information on a number lies, below which scores do not tell its spread
 
 Scores = list[Float[np.ndarray, "steps p"]]
 
@@ -61,9 +63,9 @@ def find_numbers_in_few_stretches(information: list[Float[np.ndarray, "steps k"]
 
     Stretches divide the rows evenly, as many as cosines are used to estimate the covariance of summed scores. With V_b
     the information in stretch b, (sum_b V_b)^2 / sum_b V_b^2 is nu if all V_b are equal, and 1 if all but one are 0.
-    Below FEW nu the stretches are few. Scores of such a number differ from 0 only there, where cosines hardly change,
-    so that the cosines' estimate misses their variance.
-    `information`: for each recording, the information of each row on each number (steps, k).
+    Below FEW_STRETCHES nu the stretches are few. Scores of such a number differ from 0 only there, where cosines hardly
+    change, so that the cosines' estimate misses their variance. `information`: for each recording, the information of
+    each row on each number (steps, k).
     """
     by_recording = []
     for rows in information:
@@ -71,7 +73,7 @@ def find_numbers_in_few_stretches(information: list[Float[np.ndarray, "steps k"]
         begins = np.arange(count) * len(rows) // count
         by_recording.append(np.add.reduceat(rows, begins, axis=0))  # sums over each stretch
     stretches = np.maximum(np.concatenate(by_recording), 0.0)  # V, (stretches, k)
-    return np.asarray(stretches.sum(axis=0) ** 2 < FEW * len(stretches) * np.sum(stretches**2, axis=0))
+    return np.asarray(stretches.sum(axis=0) ** 2 < FEW_STRETCHES * len(stretches) * np.sum(stretches**2, axis=0))
 
 
 def remove_predicted_scores(
@@ -171,7 +173,7 @@ def estimate_long_run_covariance(
     """
     match method:
         case "bootstrap":
-            sums = bootstrap_block_sums(scores, DRAWS, 0)
+            sums = bootstrap_block_sums(scores, BOOTSTRAP_DRAWS, 0)
             return LongRunCovariance(np.atleast_2d(np.cov(sums.T)), freedom=np.inf)
         case "cosines":
             return estimate_by_cosines(scores)

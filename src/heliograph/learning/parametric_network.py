@@ -23,7 +23,10 @@ from heliograph.simulation.network import Network
 Kind = Literal["real", "positive", "probability", "simplex", "covariance"]
 Build = TypeAliasType("Build", Callable[[], Network])  # a function that returns a network
 
-ASIDE, IRRATIONAL = 0.1, 0.6180339887498949  # unconstrained distance of a point near the start; multiples of it differ
+DISTANCE_FROM_START, IRRATIONAL = (
+    0.1,
+    0.6180339887498949,
+)  # unconstrained distance of a point near the start; multiples of it differ
 
 DOMAINS: dict[Kind, Domain] = {
     "real": REAL,
@@ -242,7 +245,9 @@ class Description:
         either side of the start, it is the network at the start.
         """
         start = self.parameters.start
-        away = ASIDE * (1 + np.modf(IRRATIONAL * np.arange(1, len(start) + 1))[0])  # different for each number
+        away = DISTANCE_FROM_START * (
+            1 + np.modf(IRRATIONAL * np.arange(1, len(start) + 1))[0]
+        )  # different for each number
         for direction in (1.0, -1.0):
             with suppress(ValueError):
                 return self.at_point(start + direction * away)

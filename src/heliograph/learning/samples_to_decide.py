@@ -10,6 +10,7 @@ from heliograph.filters.gaussian.gaussian_prediction import open_loop_filter
 from heliograph.learning.likelihood.predictive_density import (
     NODES,
     ChannelDensities,
+    ExpectedSignals,
     evaluate_predictive,
     make_signal_filter,
 )
@@ -86,10 +87,11 @@ def samples_to_tell(
     means, deviations = list[float](), list[float]()
     any_filter = {"open_loop": open_loop_filter(network.plant)}  # of the runs only the measurements are used
     for true, other in (channels, channels[::-1]):
+        # Measurements z (runs, steps, received) under the true law, and log p_true - log p_other of each (runs, steps).
         world = Network(network.plant, {name: Node(node.sensor, true, any_filter)})
         z = monte_carlo(world, steps, RUNS, seed, inputs=inputs).measurements[name]
         of_true, of_other = (_predict_densities(network, node, channel, z, u, nodes) for channel in (true, other))
-        log_ratio = np.asarray(of_true - of_other)  # (runs, steps)
+        log_ratio = np.asarray(of_true - of_other)
         means.append(float(log_ratio.mean()))
         deviations.append(float(np.sqrt(np.mean([estimate_long_run_deviation(run) ** 2 for run in log_ratio]))))
     # n = (z (sqrt V_a + sqrt V_b) / (I_a + I_b))^2, with the normal quantile z that is exceeded with probability
@@ -164,6 +166,6 @@ def _predict_densities(
     filter = make_signal_filter(network.plant, node.sensor, received)
     parts = ChannelDensities.of(received, nodes)
     # Mean and covariance of the expected signal, and the measurement, with all steps of all runs in one axis.
-    expected = filter.expect_signals(z, u)
-    y, covariance, measured = (np.asarray(array).reshape(-1, *array.shape[2:]) for array in expected)
-    return evaluate_predictive((y, covariance, measured), parts).log_likelihood.reshape(z.shape[:2])
+    by_run = filter.expect_signals(z, u)
+    expected = ExpectedSignals(*(np.asarray(array).reshape(-1, *array.shape[2:]) for array in by_run))
+    return evaluate_predictive(expected, parts).log_likelihood.reshape(z.shape[:2])

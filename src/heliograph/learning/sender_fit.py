@@ -21,17 +21,17 @@ from heliograph.simulation.likelihood import log_likelihood
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 
-IMPOSSIBLE = -1e300  # log-likelihood of impossible recordings: a search needs a number
+IMPOSSIBLE_LIKELIHOOD = -1e300  # log-likelihood of impossible recordings: a search needs a number
 FIRST_REACH = 0.05  # from the maximum towards an end of an interval, in unconstrained coordinates
 LARGEST_SIMPLEX = 0.2  # edges of a first simplex, in unconstrained coordinates
 MOST_EVALUATIONS = 200  # of a search, for each coordinate
-NORMAL = 1.96  # deviations of a normal law on either side, between which 95 % lie
-FURTHEST = (
+NORMAL_QUANTILE = 1.96  # deviations of a normal law on either side, between which 95 % lie
+FURTHEST_END = (
     4.0  # in unconstrained coordinates, in logarithms and logits: an interval that reaches so far has no end there
 )
-HALVINGS = 12
-DIGITS = 1e-4  # of an unconstrained coordinate
-NEAR = 1e-3  # of the ends of an interval, and of what is searched for them
+BISECTIONS = 12
+SIMPLEX_ACCURACY = 1e-4  # of an unconstrained coordinate
+END_ACCURACY = 1e-3  # of the ends of an interval, and of what is searched for them
 
 Likelihood = Callable[[Float[np.ndarray, " p"]], float]
 
@@ -145,13 +145,13 @@ def fit_sender(
     def likelihood(x: Float[np.ndarray, " p"]) -> float:
         """Return the log-likelihood of all recordings at unconstrained coordinates x (p,).
 
-        `data`: recordings side by side; the first `lengths` rows of each count. IMPOSSIBLE: a very low number that
-        replaces -inf and NaN, since the search needs numbers.
+        `data`: recordings side by side; the first `lengths` rows of each count. IMPOSSIBLE_LIKELIHOOD: a very low
+        number that replaces -inf and NaN, since the search needs numbers.
         """
         filter = make_event_filter(description.at_point(x))
         recordings = zip(data.measurements, data.inputs, data.lengths, strict=True)
         total = sum(float(log_likelihood(filter, z[:steps], u[:steps])) for z, u, steps in recordings)
-        return total if np.isfinite(total) else IMPOSSIBLE
+        return total if np.isfinite(total) else IMPOSSIBLE_LIKELIHOOD
 
     # The maximum: from the start, and from others drawn within one unit of each logarithm or logit.
     random = np.random.default_rng(seed)
@@ -229,7 +229,7 @@ def _climb_simplex(
     start: Float[np.ndarray, " p"],
     enough: float = np.inf,
     size: float = LARGEST_SIMPLEX,
-    digits: float = DIGITS,
+    digits: float = SIMPLEX_ACCURACY,
 ) -> "_BestPoint":
     """Return the best point of a search by Nelder and Mead from `start`.
 
@@ -287,7 +287,7 @@ def _add_interval(row: Row, description: Description, likelihood: Likelihood, to
     """Return the row of an estimate with its interval, and a standard error that fits the interval's width.
 
     The profile is the log-likelihood maximised over all other coordinates. The interval ends where the profile has
-    fallen to a level. NORMAL: a 95 % interval reaches 1.96 standard errors to either side.
+    fallen to a level. NORMAL_QUANTILE: a 95 % interval reaches 1.96 standard errors to either side.
 
     Args:
         row: the row without an interval.
@@ -306,7 +306,7 @@ def _add_interval(row: Row, description: Description, likelihood: Likelihood, to
         point[coordinate] += side * profile.find_distance_to_level(top.x, side)
         ends.append(float(description.parameters.entries_at(point)[index]))
     low, high = sorted(ends)
-    return row._replace(low=low, high=high, standard_error=(high - low) / (2 * NORMAL))
+    return row._replace(low=low, high=high, standard_error=(high - low) / (2 * NORMAL_QUANTILE))
 
 
 class _BestPoint(NamedTuple):
@@ -341,21 +341,21 @@ class _Profile(NamedTuple):
     def find_distance_to_level(self, top: Float[np.ndarray, " p"], side: float) -> float:
         """Return how far from the maximum `top` (p,) the profile falls to the level, to one side (-1.0 or 1.0).
 
-        The distance is doubled until the profile is below the level, or beyond FURTHEST, where an interval counts as
-        without an end; then it is found by bisection, to NEAR.
+        The distance is doubled until the profile is below the level, or beyond FURTHEST_END, where an interval counts
+        as without an end; then it is found by bisection, to END_ACCURACY.
         """
         inside, outside = 0.0, FIRST_REACH  # distances at which the profile is above and below the level
         nearby = _ProfilePoint(top[self.coordinate], np.delete(top, self.coordinate))
-        while outside < FURTHEST:
+        while outside < FURTHEST_END:
             is_above, nearby = self.is_above_level(top[self.coordinate] + side * outside, nearby)
             if not is_above:
                 break
             inside, outside = outside, 2 * outside
-        for _ in range(HALVINGS):
+        for _ in range(BISECTIONS):
             middle = (inside + outside) / 2
             is_above, nearby = self.is_above_level(top[self.coordinate] + side * middle, nearby)
             inside, outside = (middle, outside) if is_above else (inside, middle)
-            if outside - inside < NEAR:
+            if outside - inside < END_ACCURACY:
                 break
         return outside
 
@@ -370,12 +370,12 @@ class _Profile(NamedTuple):
             value: value of the coordinate.
             nearby: another point of the profile, whose other coordinates begin the search.
         """
-        size = float(np.clip(abs(value - nearby.value), 10 * NEAR, LARGEST_SIMPLEX))
+        size = float(np.clip(abs(value - nearby.value), 10 * END_ACCURACY, LARGEST_SIMPLEX))
         best = _climb_simplex(
             lambda others: self.likelihood(np.insert(others, self.coordinate, value)),
             nearby.others,
             enough=self.level,
             size=size,
-            digits=NEAR,
+            digits=END_ACCURACY,
         )
         return best.total > self.level, _ProfilePoint(value, best.x)

@@ -22,8 +22,8 @@ from heliograph.random_affine.words.bit_flips import Flips
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 
-MOST = 24  # bits of a word
-STEPS = 300  # of the relaxation
+MOST_BITS = 24  # bits of a word
+RELAXATION_STEPS = 300  # of the relaxation
 ROUNDING = 1e-13  # relative decrease of the error that is rounding's
 
 
@@ -76,7 +76,7 @@ class _PlantAndSenders(NamedTuple):
         process: covariance Q of its noise (n, n).
         rows: c_i of each sender's sensor (senders, n).
         information: [i, B] = j_i(B), what a word of B bits says of c_i x, as the inverse of a noise variance, for B
-            from 0 to MOST (senders, MOST + 1).
+            from 0 to MOST_BITS (senders, MOST_BITS + 1).
     """
 
     transition: Float[np.ndarray, "n n"]
@@ -131,7 +131,7 @@ def design_bits(network: Network, total: int) -> BitsDesign:
 
 
 def _collect_plant_and_senders(network: Network) -> _PlantAndSenders:
-    """Return plant, sensors and the information of their words of 0 to MOST bits, as arrays.
+    """Return plant, sensors and the information of their words of 0 to MOST_BITS bits, as arrays.
 
     Raises:
         ValueError: a plant that is not linear and stable; a node without an encoder, or with several outputs.
@@ -157,7 +157,7 @@ def _collect_plant_and_senders(network: Network) -> _PlantAndSenders:
 
 
 def _compute_word_information(variance: float, encoder_range: float, gain: float) -> Float[np.ndarray, " bits"]:
-    """Return the information j(B) of words of B = 0 to MOST bits about the measured value; it is 0 for no bits.
+    """Return the information j(B) of words of B = 0 to MOST_BITS bits about the measured value; it is 0 for no bits.
 
     j(B) = 1 / (R + D^2/12 + U (1/g^2 - 1)), with the step D = range / (2^B - 1), and U = D^2 (4^B - 1)/12 the variance
     of uniform words.
@@ -167,7 +167,7 @@ def _compute_word_information(variance: float, encoder_range: float, gain: float
         encoder_range: width of the range of values that the words cover.
         gain: g = 1 - 2p of each bit, where p is the probability that it is flipped.
     """
-    counts = np.arange(1, MOST + 1)
+    counts = np.arange(1, MOST_BITS + 1)
     step = encoder_range / (2.0**counts - 1)
     # Of gain 0, bits that are flipped half of the time, a word says nothing.
     noise = gain**2 * (variance + step**2 / 12) + step**2 / 12 * (4.0**counts - 1) * (1 - gain**2)
@@ -266,7 +266,7 @@ def _add_bits_greedily(senders: _PlantAndSenders, total: int) -> Float[np.ndarra
         # by.
         best = (0.0, 0, 0, error)
         for i in range(len(bits)):
-            for more in range(1, min(left, MOST - bits[i]) + 1):
+            for more in range(1, min(left, MOST_BITS - bits[i]) + 1):
                 tried = bits.copy()
                 tried[i] += more
                 error_then = _compute_steady_error(senders, _information_of_bits(senders, tried))
@@ -292,7 +292,7 @@ def _bound_by_relaxation(senders: _PlantAndSenders, total: int) -> float:
     """
     hulls = [_find_envelope(values) for values in senders.information]
     j, bound = np.zeros(len(hulls)), -np.inf
-    for k in range(STEPS):
+    for k in range(RELAXATION_STEPS):
         slopes, error = _compute_error_slopes(senders, j), _compute_steady_error(senders, j)
         best_on_tangent = _spend_bits(hulls, -slopes, total)
         least_on_tangent = error - float(slopes @ (j - best_on_tangent))

@@ -11,7 +11,12 @@ from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import ArrayLike, Float
 
 WEIGHT = "weight of the error"
-SHARPER = (16, 128, 2048, 32768)  # smoothing of the largest eigenvalue, less and less: n^(1/32768) is left at the end
+SHARPNESSES = (
+    16,
+    128,
+    2048,
+    32768,
+)  # smoothing of the largest eigenvalue, less and less: n^(1/32768) is left at the end
 
 Matrices = Float[np.ndarray, "time n n"]
 
@@ -94,12 +99,12 @@ class Error(Module):
         """Return the number to be made small, as a function of covariances, for a plant with these states.
 
         `self.matrix`: the weight of the states' covariance. If the worst direction counts (`self.worst`), the number is
-        the largest eigenvalue, smoothed by an exponent of SHARPER, the sharpest last.
+        the largest eigenvalue, smoothed by an exponent of SHARPNESSES, the sharpest last.
         """
         # Only the last step counts (the last unit vector), or all steps count alike.
         shares = np.eye(self.steps)[-1] if self.at_end else np.full(self.steps, 1 / self.steps)
         weight = np.tile(self.matrix(states), (self.steps, 1, 1))
-        return Criterion(weight=weight, shares=shares, sharpness=SHARPER[-1] if self.worst else None)
+        return Criterion(weight=weight, shares=shares, sharpness=SHARPNESSES[-1] if self.worst else None)
 
 
 class SmoothedError(NamedTuple):
@@ -158,7 +163,7 @@ class Criterion(NamedTuple):
 
     def list_from_smoothest(self) -> "list[Criterion]":
         """Return the criteria from the smoothest to this one, by which a search begins: only this one for a trace."""
-        return [self] if self.sharpness is None else [self._replace(sharpness=q) for q in SHARPER]
+        return [self] if self.sharpness is None else [self._replace(sharpness=q) for q in SHARPNESSES]
 
     def _differentiate_steps(self, p: Matrices) -> tuple[Float[np.ndarray, "time"], Matrices]:
         """Return f(P_k) (time,) and df/dP_k (time, n, n) of each step: f is tr W P or the smoothed eigenvalue.

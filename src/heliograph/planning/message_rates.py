@@ -20,11 +20,11 @@ from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.simulate import monte_carlo
 
-NODES = 80  # Gauss-Legendre nodes of each part of the line: the densities are smooth in each
-RAREST = 1e-6  # rate of messages that a grid holds
-LONGEST = 100  # deviations of a step from 0, beyond which there are too many nodes
+QUADRATURE_NODES = 80  # Gauss-Legendre nodes of each part of the line: the densities are smooth in each
+RAREST_RATE = 1e-6  # rate of messages that a grid holds
+LONGEST_LINE = 100  # deviations of a step from 0, beyond which there are too many nodes
 GRID_ACCURACY = 1e-3  # relative, of a rate by a grid
-REACH = 12.0  # deviations at which a density ends
+TAIL_DEVIATIONS = 12.0  # deviations at which a density ends
 
 
 @readable
@@ -126,10 +126,10 @@ def prediction_error_rate(plant: AnyPlant, sensor: AnySensor, delta: float, loss
     s = (a * a * posterior + q) / np.sqrt(a * a * posterior + q + r / c**2)
     # The line in parts, within delta and beyond, with nodes and weights of an integral over it. Beyond delta e stays
     # only where what is sent is lost, so that without losses there is nothing.
-    far = delta + REACH * s / np.sqrt(1 - loss)
+    far = delta + TAIL_DEVIATIONS * s / np.sqrt(1 - loss)
     edges = [-far, -delta, delta, far] if loss else [-delta, delta]
-    if far > LONGEST * s:
-        most = f"a line of at most {LONGEST} deviations of a step, {LONGEST * s:.3g}"
+    if far > LONGEST_LINE * s:
+        most = f"a line of at most {LONGEST_LINE} deviations of a step, {LONGEST_LINE * s:.3g}"
         raise fail("delta and loss", most, f"{far:.3g}")
     nodes, weights = _make_quadrature(edges, s)
     # The integral equation of v at the nodes (Nystrom's method), then the sums over a cycle.
@@ -185,8 +185,8 @@ def send_on_delta_rate(plant: AnyPlant, sensor: AnySensor, delta: float) -> floa
     """
     system = _require_scalar_system(plant, sensor, without_inputs=True)
     rate = _send_on_delta_rate(system, float(scalar("delta", delta, TINY)))
-    if rate < RAREST:
-        raise fail("delta", f"one at which more than {RAREST:g} messages are sent a step", f"{delta:g}")
+    if rate < RAREST_RATE:
+        raise fail("delta", f"one at which more than {RAREST_RATE:g} messages are sent a step", f"{delta:g}")
     return rate
 
 
@@ -283,14 +283,14 @@ def _require_scalar_system(plant: AnyPlant, sensor: AnySensor, without_inputs: b
 def _make_quadrature(edges: list[float], unit: float) -> tuple[np.ndarray, np.ndarray]:
     """Return Gauss-Legendre nodes and weights on a line that is cut at `edges`, and into intervals of at most 8 units.
 
-    NODES nodes suffice on each interval, since the integrand changes over a unit or more.
+    QUADRATURE_NODES nodes suffice on each interval, since the integrand changes over a unit or more.
     """
     intervals: list[tuple[float, float]] = []
     for begin, end in pairwise(edges):  # each part of the line
         count = int(np.ceil((end - begin) / (8 * unit)))
         intervals += pairwise(np.linspace(begin, end, count + 1))
     # Nodes and weights of the interval from -1 to 1, moved to each of these.
-    x, w = np.polynomial.legendre.leggauss(NODES)
+    x, w = np.polynomial.legendre.leggauss(QUADRATURE_NODES)
     nodes = np.concatenate([(a + b) / 2 + (b - a) / 2 * x for a, b in intervals])
     weights = np.concatenate([(b - a) / 2 * w for a, b in intervals])
     return nodes, weights

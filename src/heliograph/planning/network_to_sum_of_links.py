@@ -7,7 +7,7 @@ from heliograph.factors.square_root_update import observe_information, roots_of
 from heliograph.model.sensor import LinearSensor
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import Float
-from heliograph.planning.sum_of_links import ALIKE, SummedLinks
+from heliograph.planning.sum_of_links import RELATIVE_ROUNDING, SummedLinks
 from heliograph.planning.transmitters import (
     amplify_transmitter,
     compute_sent_powers,
@@ -108,8 +108,8 @@ def steady_covariance_with_information(
         information: J = H' H, as of a measurement H x with noise of covariance I; zero if nothing is received.
     """
     eigenvalues, vectors = np.linalg.eigh(information)
-    # An eigenvalue up to the share ALIKE of the largest counts as rounding.
-    is_above_rounding = eigenvalues > ALIKE * max(eigenvalues[-1], 0.0)
+    # An eigenvalue up to the share RELATIVE_ROUNDING of the largest counts as rounding.
+    is_above_rounding = eigenvalues > RELATIVE_ROUNDING * max(eigenvalues[-1], 0.0)
     if not is_above_rounding.any():
         return np.asarray(scipy.linalg.solve_discrete_lyapunov(matrix, process))
     H = (vectors[:, is_above_rounding] * np.sqrt(eigenvalues[is_above_rounding])).T

@@ -9,8 +9,8 @@ from heliograph.numerics.check import fail, instance, scalar, table
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import ArrayLike, Bool, Float
 
-MET = 1e-9  # relative excess over a limit that counts as met
-AT_LIMIT = 1e-6  # relative: a power so near to its limit has reached it
+MET_EXCESS = 1e-9  # relative excess over a limit that counts as met
+NEAR_LIMIT = 1e-6  # relative: a power so near to its limit has reached it
 
 Powers = Float[np.ndarray, "time free"]
 PerTransmitter = float | dict[str, float] | None
@@ -152,7 +152,7 @@ class PowerLimits(NamedTuple):
             worth: the error that a watt more of each takes away at each step (time, free).
             is_least_power: whether the total itself is what was made small.
         """
-        has_room = (powers < self.peak * (1 - AT_LIMIT)) & (powers.mean(axis=0) < self.mean * (1 - AT_LIMIT))
+        has_room = (powers < self.peak * (1 - NEAR_LIMIT)) & (powers.mean(axis=0) < self.mean * (1 - NEAR_LIMIT))
         if not is_least_power and not np.isfinite(self.total):
             has_room[:] = True
         return float(np.max(worth * len(worth), where=has_room, initial=0.0))
@@ -214,14 +214,14 @@ def make_power_limits(
 def _check_fixed_powers(what: str, power: float, limit: float) -> None:
     """Raise ValueError if transmitters that are not free already send more than a limit.
 
-    A limit counts as met within the rounding MET.
+    A limit counts as met within the rounding MET_EXCESS.
 
     Args:
         what: the limit, in words.
         power: what these transmitters send.
         limit: the limit.
     """
-    if power > limit * (1 + MET):
+    if power > limit * (1 + MET_EXCESS):
         expected = f"a {what} of at least {power:.6g}, which is sent by what is not free"
         raise fail("budget", expected, f"{limit:.6g}")
 

@@ -27,7 +27,7 @@ from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 
 BATCHES = 20  # of runs, from whose spread the standard errors come
-SAME = 1e-9  # of the entries of a schedule that is to be that of a design
+SAME_ENTRIES = 1e-9  # of the entries of a schedule that is to be that of a design
 
 Sources = dict[str, tuple[AnySensor, Channel]]  # what sends, by the beginning of its transmitters' names
 Moments = Float[np.ndarray, "batch steps m1 m1"]  # E (y, 1)(y, 1)'
@@ -116,14 +116,7 @@ def power(
     steps = 1 if horizon is None else check_horizon(horizon, covered)
     shape = steps, len(plant.inputs)
     u = np.zeros(shape) if inputs is None else array("inputs", inputs, shape)
-    # E (y, 1)(y, 1)' of what each sensor sends: exact, or the mean of drawn trajectories.
-    if _is_exact(network, sources):
-        moments = _compute_moments(network.plant, sources, u, horizon)
-    elif horizon is None:
-        raise fail("power", "a horizon, since plant or sensor is not linear", "none")
-    else:
-        runs, seed = check_count("runs", runs, BATCHES), check_seed("seed", seed)
-        moments = _draw_moments(network.plant, sources, u, runs, seed)
+    moments = _find_output_moments(network, sources, u, horizon, runs, seed)
     # A sensor with feedback sends its innovation, which stays bounded or not whatever the plant does.
     informed = _find_feedback_filters(network)
     for name, informing in informed.items():
@@ -139,6 +132,29 @@ def power(
             spread = of_batches.std(axis=0, ddof=1) if len(of_batches) > 1 else np.zeros(steps)
             standard_error[f"{name}.{hop}"] = spread / np.sqrt(len(of_batches))
     return SentPower(over_time=over_time, standard_error=standard_error, growth=growth)
+
+
+def _find_output_moments(
+    network: Network, sources: Sources, inputs: Float[np.ndarray, "steps u"], horizon: int | None, runs: int, seed: int
+) -> dict[str, Moments]:
+    """Return E (y, 1)(y, 1)' of what each sensor measures: exact for linear models, else means of drawn trajectories.
+
+    Args:
+        network: the network, for its plant.
+        sources: sensor and channel by node.
+        inputs: inputs of the plant (steps, inputs).
+        horizon: number of steps from the initial law on; None for the steady state.
+        runs: number of drawn trajectories.
+        seed: of the draws.
+
+    Raises:
+        ValueError: no horizon where trajectories are drawn, too few of them.
+    """
+    if _is_exact(network, sources):
+        return _compute_moments(network.plant, sources, inputs, horizon)
+    if horizon is None:
+        raise fail("power", "a horizon, since plant or sensor is not linear", "none")
+    return _draw_moments(network.plant, sources, inputs, check_count("runs", runs, BATCHES), check_seed("seed", seed))
 
 
 def _is_exact(network: Network, sources: Sources) -> bool:
@@ -285,7 +301,9 @@ def _compute_relay_powers(network: Network, horizon: int | None) -> dict[str, Fl
         gains[name] = np.asarray(schedule.gain)[:steps]
         expected = expected_rows[:, ends[name] - count : ends[name]]
         pairs = (schedule.transition, moved.transition), (schedule.expected, expected)
-        if not all(np.shape(a)[1:] == b.shape[1:] and np.allclose(a[:steps], b, SAME, SAME) for a, b in pairs):
+        if not all(
+            np.shape(a)[1:] == b.shape[1:] and np.allclose(a[:steps], b, SAME_ENTRIES, SAME_ENTRIES) for a, b in pairs
+        ):
             raise fail(f"schedule of {name!r}", "s+ = A s + K (z - B s - b), as relay_schedules makes them", "another")
     # The sensor (the first column of the slots) sends y where it transmits, of the power E y'y: the trace of E y y',
     # which E (y, 1)(y, 1)' holds without its last row and column.

@@ -16,12 +16,15 @@ from heliograph.numerics.types import Bool, Float
 
 Vector = Float[np.ndarray, "x"]
 
-ITERATIONS = 400
-FINE, COARSE = 1e-14, 1e-8  # relative change at which a descent ends, and that of many of which the best goes on
-ROUNDS = 4  # of a descent begun again where it ended, its Hessian forgotten, and of Newton's method
-FEASIBLE = 1e-7  # relative excess over a limit that counts as none
-ACTIVE = 1e-7  # relative: how near a limit is one that is reached
-SHIFT = 1e-5  # relative, of the differences of gradients that make a Hessian
+MOST_ITERATIONS = 400
+FINE_TOLERANCE, COARSE_TOLERANCE = (
+    1e-14,
+    1e-8,
+)  # relative change at which a descent ends, and that of many of which the best goes on
+MOST_ROUNDS = 4  # of a descent begun again where it ended, its Hessian forgotten, and of Newton's method
+FEASIBLE_EXCESS = 1e-7  # relative excess over a limit that counts as none
+ACTIVE_ROOM = 1e-7  # relative: how near a limit is one that is reached
+DIFFERENCE_WIDTH = 1e-5  # relative, of the differences of gradients that make a Hessian
 ROUNDING = 1e-14  # relative
 LEAST_SIZE = 1e-12  # unit of a value that is less, or 0, at the start
 
@@ -170,17 +173,21 @@ class ScaledProgramme:
         return room if target is None else np.append(room, 1 - evaluation.error / target)
 
     def limit_room_slope(self, z: Vector) -> Float[np.ndarray, "limits x"]:
-        """Return the derivative of `limit_room` by z, (limits, x)."""
+        """Return the derivatives of `limit_room`, the unused part of each limit, by z (limits, x).
+
+        They are 0 at a point without an evaluation, where the error grows without limit.
+        """
         rows, most, target = self.limits.rows, self.limits.most, self.limits.target
         evaluation = self.evaluate_at(z)
+        unit = self.problem.unit
         if evaluation is None:
             return np.zeros((len(most) + (target is not None), len(z)))
-        slope = -(rows @ evaluation.power_slope) * self.problem.unit
-        return slope if target is None else np.vstack([slope, -evaluation.error_slope * self.problem.unit / target])
+        slope = -(rows @ evaluation.power_slope) * unit  # by z = x / unit
+        return slope if target is None else np.vstack([slope, -evaluation.error_slope * unit / target])
 
     def is_feasible(self, z: Vector) -> bool:
-        """Return whether the error is finite at z and the limits are met, to a relative excess of FEASIBLE (1e-7)."""
-        return self.evaluate_at(z) is not None and bool(np.all(self.limit_room(z) >= -FEASIBLE))
+        """Return whether the error is finite at z and the limits are met, up to the relative FEASIBLE_EXCESS (1e-7)."""
+        return self.evaluate_at(z) is not None and bool(np.all(self.limit_room(z) >= -FEASIBLE_EXCESS))
 
     def merit(self, z: Vector) -> float:
         """Return the objective at a point within the limits, and infinity beyond them, to compare points."""
@@ -228,7 +235,7 @@ class ScaledProgramme:
             tolerance: relative change of the value at which the minimisation ends.
         """
         optimum = minimize(function, z, jac=True, method="SLSQP", bounds=self.bounds, constraints=constraints,
-                          options={"ftol": tolerance, "maxiter": ITERATIONS})  # fmt: skip
+                          options={"ftol": tolerance, "maxiter": MOST_ITERATIONS})  # fmt: skip
         end = np.clip(optimum.x, self.bounds.lb, self.bounds.ub)
         if not np.all(np.isfinite(end)):
             return z
@@ -243,7 +250,7 @@ class ScaledProgramme:
         only rounding, leaves the limits, or raises the objective plus a penalty on the active limits. After each,
         `restore` moves the point back into limits that rounding broke.
         """
-        for _ in range(ROUNDS):
+        for _ in range(MOST_ROUNDS):
             newton = self._solve_newton_step(z)
             if newton is None:
                 break
@@ -273,9 +280,11 @@ class ScaledProgramme:
         of the active limits' room, and the Hessian H of the Lagrangian, value - m' room. None is returned where all
         variables are at bounds, or derivatives are not finite.
         """
-        index = np.flatnonzero((z > self.bounds.lb + ACTIVE) & (z < self.bounds.ub - ACTIVE))  # variables at no bound
+        index = np.flatnonzero(
+            (z > self.bounds.lb + ACTIVE_ROOM) & (z < self.bounds.ub - ACTIVE_ROOM)
+        )  # variables at no bound
         room = self.limit_room(z)
-        active = room <= ACTIVE
+        active = room <= ACTIVE_ROOM
         if not len(index):
             return None
         # A and g, by each variable over its own size.
@@ -324,8 +333,8 @@ class ScaledProgramme:
         at_z, hessian = lagrangian_gradient(z), np.empty((len(index), len(index)))
         for column, variable in enumerate(index):
             shift = np.zeros_like(z)
-            shift[variable] = SHIFT * scale[column]
-            hessian[:, column] = (lagrangian_gradient(z + shift) - at_z) / SHIFT
+            shift[variable] = DIFFERENCE_WIDTH * scale[column]
+            hessian[:, column] = (lagrangian_gradient(z + shift) - at_z) / DIFFERENCE_WIDTH
         return hessian
 
 
@@ -343,13 +352,13 @@ def search_from_starts(problem: DescentProblem, limits: PowerAndErrorLimits, sta
     # Coarse descents from everywhere, the largest eigenvalue sharper and sharper.
     for sharpness in problem.sharpnesses if len(points) > 1 else problem.sharpnesses[:-1]:
         programmes = [ScaledProgramme(problem, limits, sharpness, z * problem.unit) for z in points]
-        points = [programme.descend(z, COARSE) for programme, z in zip(programmes, points, strict=True)]
+        points = [programme.descend(z, COARSE_TOLERANCE) for programme, z in zip(programmes, points, strict=True)]
     programme = ScaledProgramme(problem, limits, sharpest, points[0] * problem.unit)
     best = min(points, key=programme.merit)
     # A fine descent from the best, begun again as long as that helps.
-    for _ in range(ROUNDS):
+    for _ in range(MOST_ROUNDS):
         before = programme.merit(best)
-        best = programme.descend(best, FINE)
-        if not np.isinf(before) and not programme.merit(best) < before * (1 - FINE):
+        best = programme.descend(best, FINE_TOLERANCE)
+        if not np.isinf(before) and not programme.merit(best) < before * (1 - FINE_TOLERANCE):
             break
     return programme.polish_by_newton(best) * problem.unit if programme.is_feasible(best) else None

@@ -23,7 +23,13 @@ from heliograph.planning.plant_moments import (
     steady_moment_with_one,
 )
 from heliograph.planning.power_budget import PowerLimits, make_budget, make_power_limits, make_unlimited
-from heliograph.planning.sum_of_links import ALIKE, HALVINGS, SummedLinks, Vector, find_amplitudes_by_formula
+from heliograph.planning.sum_of_links import (
+    BISECTIONS,
+    RELATIVE_ROUNDING,
+    SummedLinks,
+    Vector,
+    find_amplitudes_by_formula,
+)
 from heliograph.planning.transmitters import (
     amplify_transmitter,
     find_free_transmitters,
@@ -36,7 +42,7 @@ from heliograph.random_affine.sum_of_maps import Superposed
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 
-SEARCHES = 30  # of a power that reaches a target: to 1e-9 of it
+BISECTIONS_BY_SEARCH = 30  # of a power that reaches a target: to 1e-9 of it
 DOUBLINGS = 100  # of a power without limit, until it reaches a target
 
 
@@ -265,14 +271,14 @@ def _find_least_power_amplitudes(task: SumOfLinksTask, target: float) -> tuple[V
     best, certificate = _find_amplitudes_that_reach(task, target)
     largest = float((best**2 * task.links.unit)[task.free].sum())
     low, high = 0.0, largest
-    for _ in range(HALVINGS if certificate.convex else SEARCHES):
+    for _ in range(BISECTIONS if certificate.convex else BISECTIONS_BY_SEARCH):
         middle = (low + high) / 2
         tried = _find_best_at_power(task, middle, best)
         if task.compute_error(tried) <= target:
             high, best = middle, tried
         else:
             low = middle
-        if high - low <= ALIKE * largest:
+        if high - low <= RELATIVE_ROUNDING * largest:
             break
     needed = float((best**2 * task.links.unit).sum())
     bound = needed if certificate.convex else _bound_least_power(task, target, needed)
@@ -304,7 +310,7 @@ def _bound_least_power(task: SumOfLinksTask, target: float, needed: float) -> fl
         needed: a total power of all links that reaches it.
     """
     low, high = 0.0, needed - task.fixed
-    for _ in range(HALVINGS):
+    for _ in range(BISECTIONS):
         middle = (low + high) / 2
         low, high = (low, middle) if task.bound_error(middle) <= target else (middle, high)
     return low + task.fixed
@@ -330,7 +336,7 @@ def _find_amplitudes_that_reach(task: SumOfLinksTask, target: float) -> tuple[Ve
             break
         total = 2 * total
         found, certificate = _find_least_error_amplitudes(task, total)
-    if certificate.value > target * (1 + ALIKE):
+    if certificate.value > target * (1 + RELATIVE_ROUNDING):
         within = "whatever the power" if unlimited else "within the budget"
         raise fail("target error", f"at least {certificate.value:.6g}, the least found {within}", f"{target:.6g}")
     return found, certificate

@@ -23,7 +23,7 @@ from heliograph.random_affine.modes import joint_modes
 from heliograph.random_affine.moments.signal_path import ChannelPosition, Second, SignalMoment, Visit
 from heliograph.simulation.node import Node
 
-UNCHANGED = 1e-12  # change of a law in a step that counts as none
+UNCHANGED_LAW = 1e-12  # change of a law in a step that counts as none
 
 
 def require_plain_senders(what: str, nodes: Mapping[str, object]) -> None:
@@ -117,7 +117,7 @@ def compute_steady_powers(channel: AbstractRandomAffine, second: Second) -> dict
     `second`: E (y, 1)(y, 1)' of what goes into the channel.
     """
     joint = joint_modes(channel, order=2)
-    starts_stationary = np.allclose(joint.initial @ joint.transition, joint.initial, rtol=0.0, atol=UNCHANGED)
+    starts_stationary = np.allclose(joint.initial @ joint.transition, joint.initial, rtol=0.0, atol=UNCHANGED_LAW)
     law = joint.initial if starts_stationary else find_stationary_law(joint.transition)
     return compute_powers_of_law(channel, second, law)
 

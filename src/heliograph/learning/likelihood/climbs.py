@@ -8,10 +8,10 @@ import numpy as np
 from heliograph.numerics.types import Bool, Float
 
 NOISE = 1e-13  # rounding of a log-likelihood, as a share of its size
-JOINED = 0.1  # standard errors between two climbs to one top, and of either from it
-BENT = 0.5  # of the information between two such climbs, that the likelihood bends by at least
-ALIKE = 0.1  # of the gain between two such climbs, that their slopes may leave unexplained
-NEIGHBOURS = 1.0  # between logarithms or logits of two such climbs, whatever the information says
+JOINING_DISTANCE = 0.1  # standard errors between two climbs to one top, and of either from it
+LEAST_BEND = 0.5  # of the information between two such climbs, that the likelihood bends by at least
+UNEXPLAINED_GAIN = 0.1  # of the gain between two such climbs, that their slopes may leave unexplained
+NEIGHBOUR_DISTANCE = 1.0  # between logarithms or logits of two such climbs, whatever the information says
 
 # Log-likelihood l, its gradient and its Gauss-Newton information (near the Hessian of -l) at a point of each climb; and
 # the function that returns them at such points.
@@ -111,10 +111,11 @@ class Climbs(NamedTuple):
 def join_climbs(state: Climbs, moving: np.ndarray, domains: OpenEnds) -> Climbs:
     """Return the state in which each climb a is ended that goes to the same top as a higher climb b.
 
-    Two climbs to one top cost twice as much. Both are within JOINED standard errors of a top and of each other, by the
-    information I of either, and less than NEIGHBOURS apart in every logarithm and logit. Between them, along d = x_b -
-    x_a, the log-likelihood l is concave: l_b - l_a is (g_a + g_b)' d / 2 as of a quadratic with gradients g, and
-    (g_a - g_b)' d >= BENT d' I d. `moving`: coordinates that move (climbs, p). `domains`: which are plain real numbers.
+    Two climbs to one top cost twice as much. Both are within JOINING_DISTANCE standard errors of a top and of each
+    other, by the information I of either, and less than NEIGHBOUR_DISTANCE apart in every logarithm and logit. Between
+    them, along d = x_b - x_a, the log-likelihood l is concave: l_b - l_a is (g_a + g_b)' d / 2 as of a quadratic with
+    gradients g, and (g_a - g_b)' d >= LEAST_BEND d' I d. `moving`: coordinates that move (climbs, p). `domains`: which
+    are plain real numbers.
     """
     climbs, g = np.arange(len(state.x)), np.nan_to_num(state.gradient)
     d = state.x[None, :] - state.x[:, None]  # [a, b]: from climb a to climb b, (a, b, p)
@@ -125,12 +126,12 @@ def join_climbs(state: Climbs, moving: np.ndarray, domains: OpenEnds) -> Climbs:
     gain = state.total[None] - state.total[:, None]
     gain_of_quadratic = np.einsum("abi,abi->ab", d, g[:, None] + g[None]) / 2
     slope_fall = np.einsum("abi,abi->ab", d, g[:, None] - g[None])
-    near_top = (2 * state.remaining < JOINED**2) & (state.joined == climbs)  # 2 * remaining: distance squared
-    neighbours = np.all(domains.free | (np.abs(d) < NEIGHBOURS), axis=2)
+    near_top = (2 * state.remaining < JOINING_DISTANCE**2) & (state.joined == climbs)  # 2 * remaining: distance squared
+    neighbours = np.all(domains.free | (np.abs(d) < NEIGHBOUR_DISTANCE), axis=2)
     neighbours &= np.all(moving[:, None] == moving[None], axis=2)
-    is_quadratic = np.abs(gain - gain_of_quadratic) <= ALIKE * gain + NOISE * np.abs(state.total)
-    no_saddle = is_quadratic & (slope_fall >= BENT * distance)
-    same_top = near_top[:, None] & near_top[None] & neighbours & (distance < JOINED**2) & no_saddle
+    is_quadratic = np.abs(gain - gain_of_quadratic) <= UNEXPLAINED_GAIN * gain + NOISE * np.abs(state.total)
+    no_saddle = is_quadratic & (slope_fall >= LEAST_BEND * distance)
+    same_top = near_top[:, None] & near_top[None] & neighbours & (distance < JOINING_DISTANCE**2) & no_saddle
     # [a, b] is true where b goes on: the higher one, of two that are as high the first.
     is_higher = same_top & ((gain > 0) | ((gain == 0) & (climbs[None] < climbs[:, None])))
     joins = ~state.done & np.any(is_higher, axis=1)

@@ -12,21 +12,21 @@ import numpy as np
 
 from heliograph.learning.likelihood.climbs import ClimbEnds
 from heliograph.learning.likelihood.surface import LikelihoodSurface
-from heliograph.learning.likelihood.trust_region import MOST_STEPS, NEAR, maximise_from_starts
+from heliograph.learning.likelihood.trust_region import CONVERGED_GAIN_BY_ROUNDING, MOST_STEPS, maximise_from_starts
 from heliograph.numerics.types import Bool, Float
 
 HARDLY_SEEN = 0.01  # information of a logarithm or a logit below which its number may as well be the end of its domain
-SAME = 1e-6  # nats by which a likelihood at the end of a domain may be lower, and count as the same
-SPREAD = 3.0  # of starts, in each coordinate that is a logarithm or a logit
-AWAY = 10.0  # standard errors of starts from a maximum, in each real number
-LOWERED = 10.0  # steps of a logarithm to a start near the end of its domain
-FURTHER = 5.0  # from where a number is hardly seen to where it counts as at the end
+SAME_LIKELIHOOD = 1e-6  # nats by which a likelihood at the end of a domain may be lower, and count as the same
+SPREAD_OF_LOGARITHMS = 3.0  # of starts, in each coordinate that is a logarithm or a logit
+SPREAD_OF_REALS = 10.0  # standard errors of starts from a maximum, in each real number
+WAY_TOWARDS_LOW_END = 10.0  # steps of a logarithm to a start near the end of its domain
+WAY_TO_END = 5.0  # from where a number is hardly seen to where it counts as at the end
 ROUNDS = 6  # of climbs, ends of domains, and proofs
-INWARDS = np.linspace(0.0, 40.0, 41)  # from the end of a domain
-EXACTLY = 20.0  # logarithm of the size of data over that of their innovations: two in a thousand million
-SEEN = 2.0  # nats by which a likelihood has fallen where a number is seen
-AT_ONE_POINT = 1e-3  # standard errors between starts that the first rows of a recording lead to one point
-SADDLE = -1e-3  # curvature in units of standard errors below which a point is no maximum
+DISTANCES_INWARDS = np.linspace(0.0, 40.0, 41)  # from the end of a domain
+EXACT_FIT = 20.0  # logarithm of the size of data over that of their innovations: two in a thousand million
+VISIBLE_FALL = 2.0  # nats by which a likelihood has fallen where a number is seen
+SAME_POINT = 1e-3  # standard errors between starts that the first rows of a recording lead to one point
+SADDLE_CURVATURE = -1e-3  # curvature in units of standard errors below which a point is no maximum
 
 Watch = Callable[[ClimbEnds], None]
 
@@ -97,7 +97,7 @@ class MaximumSearch:
             # The top itself is the last start, so that climbs to it join it; it is no new result, hence [:-1].
             climbed = self._climb_by_first_rows(np.concatenate([around, top.x[None]]), no_ends, own=len(around))
             totals = np.concatenate([totals, climbed.total[:-1]])
-            if climbed.total.max() > top.total + SAME:
+            if climbed.total.max() > top.total + SAME_LIKELIHOOD:
                 top = self._prove_maximum(climbed)
         self.best, self.ends = top, -np.sort(-np.nan_to_num(totals, nan=-np.inf))  # the highest first
         return top
@@ -124,8 +124,8 @@ class MaximumSearch:
     def _draw_starts_around(self, top: HighestPoint, count: int, seed: int) -> Float[np.ndarray, "points p"]:
         """Return `count` points drawn around a maximum, and one more for each number on an interval, near its low end.
 
-        Logarithms and logits are drawn within SPREAD of the maximum, real numbers within AWAY standard errors. The
-        extra point of a number has its logarithm or logit lowered by LOWERED.
+        Logarithms and logits are drawn within SPREAD_OF_LOGARITHMS of the maximum, real numbers within SPREAD_OF_REALS
+        standard errors. The extra point of a number has its logarithm or logit lowered by WAY_TOWARDS_LOW_END.
 
         Args:
             top: the maximum.
@@ -133,17 +133,21 @@ class MaximumSearch:
             seed: of the random numbers.
         """
         deviation = self.surface.standard_errors(top.x)
-        spread = np.where(self.surface.domains.free, AWAY * np.where(np.isfinite(deviation), deviation, 0.0), SPREAD)
+        spread = np.where(
+            self.surface.domains.free,
+            SPREAD_OF_REALS * np.where(np.isfinite(deviation), deviation, 0.0),
+            SPREAD_OF_LOGARITHMS,
+        )
         with_ends = np.flatnonzero(self.surface.domains.single)
         drawn = np.random.default_rng([seed, 2]).uniform(-1.0, 1.0, (count + len(with_ends), len(top.x)))
-        # A number at an end of its domain is drawn around another centre: of the distances INWARDS from the end, the
-        # last at which l has not fallen by SEEN nats.
+        # A number at an end of its domain is drawn around another centre: of the distances DISTANCES_INWARDS from the
+        # end, the last at which l has not fallen by VISIBLE_FALL nats.
         centre = top.x.copy()
         for index in np.flatnonzero(top.ends):
             _, rise = self._evaluate_inwards_of_end(top, int(index))
-            centre[index] -= top.ends[index] * INWARDS[np.flatnonzero(rise > -SEEN)[-1]]
+            centre[index] -= top.ends[index] * DISTANCES_INWARDS[np.flatnonzero(rise > -VISIBLE_FALL)[-1]]
         points = centre + drawn * spread
-        points[count + np.arange(len(with_ends)), with_ends] -= LOWERED
+        points[count + np.arange(len(with_ends)), with_ends] -= WAY_TOWARDS_LOW_END
         return (self.surface.of_first_rows() or self.surface).move_to_finite_likelihood(points, top.x)
 
     def _climb_by_first_rows(self, starts: np.ndarray, ends: np.ndarray, own: int) -> ClimbEnds:
@@ -170,10 +174,10 @@ class MaximumSearch:
             short.evaluate, starts[others], moving, domains=self.surface.domains, joining=True
         )
         x[others] = short_ends.x
-        # Each start joins the first one that is at the same point, to AT_ONE_POINT standard errors: `climbing` are the
+        # Each start joins the first one that is at the same point, to SAME_POINT standard errors: `climbing` are the
         # starts that climb, and `climb_of_start` which of these stands for each.
         error = short.standard_errors(short_ends.x[short_ends.order[0]])
-        reach = AT_ONE_POINT * np.where(np.isfinite(error), error, 0.0)
+        reach = SAME_POINT * np.where(np.isfinite(error), error, 0.0)
         are_same = np.all(np.abs(x[:, None] - x[None]) <= reach, axis=2)
         climbing, climb_of_start = np.unique(np.argmax(are_same, axis=1), return_inverse=True)
         # Climb by all rows. A point where the likelihood is not finite is first moved towards the start `own`.
@@ -210,10 +214,10 @@ class MaximumSearch:
         for index in np.flatnonzero(top.active & domains.single & (information < HARDLY_SEEN)):
             side = 1.0 if domains.high[index] and x[index] > 0 else -1.0
             moved = x.copy()
-            moved[index] += side * FURTHER
+            moved[index] += side * WAY_TO_END
             there = self.surface.evaluations(moved[None])
             is_finite = np.isfinite(there.gradient).all() and np.isfinite(there.information).all()
-            if is_finite and there.total[0] > total - SAME:
+            if is_finite and there.total[0] > total - SAME_LIKELIHOOD:
                 x, total, ends[index] = moved, float(there.total[0]), side
         if np.array_equal(ends, top.ends):
             return top
@@ -222,19 +226,20 @@ class MaximumSearch:
     def _choose_restarts(self, top: HighestPoint) -> tuple[np.ndarray | None, str]:
         """Return the points (points, p) from which to climb again if `top` is no maximum, and why it is none.
 
-        A maximum gives (None, ""). It is none if l rises by more than SAME on the way inside from an end of a domain,
-        or if the least curvature is below SADDLE (negative): both give points to climb from. It is also none if
-        Newton's step promises a gain of NEAR or more; no points help then, and the reason says so.
+        A maximum gives (None, ""). It is none if l rises by more than SAME_LIKELIHOOD on the way inside from an end of
+        a domain, or if the least curvature is below SADDLE_CURVATURE (negative): both give points to climb from. It is
+        also none if Newton's step promises a gain of CONVERGED_GAIN_BY_ROUNDING or more; no points help then, and the
+        reason says so.
         """
         # For each number at an end of its domain: climb again if l rises on the way back inside.
         for index in np.flatnonzero(top.ends):
             points, rise = self._evaluate_inwards_of_end(top, int(index))
-            if rise.max() > SAME:
+            if rise.max() > SAME_LIKELIHOOD:
                 return points[[int(rise.argmax())]], ""
         curvature = self.surface.measure_curvature(top.x, top.active)
-        if curvature.least < SADDLE:
+        if curvature.least < SADDLE_CURVATURE:
             return top.x + np.array([[1.0], [-1.0]]) * curvature.direction, ""  # on both sides of the saddle
-        if not curvature.gain < NEAR:
+        if not curvature.gain < CONVERGED_GAIN_BY_ROUNDING:
             return None, f"a step by the Hessian promises {curvature.gain:.2g} of log-likelihood"
         return None, ""
 
@@ -242,23 +247,24 @@ class MaximumSearch:
         """Return a sentence if the likelihood has no maximum because the network reproduces the data exactly, else "".
 
         l then grows for ever as variances fall, but a climb ends where innovations are rounding. l per number of data
-        is about -log |innovation|, so l + log |data| is about log(|data| / |innovation|): above EXACTLY it is rounding.
+        is about -log |innovation|, so l + log |data| is about log(|data| / |innovation|): above EXACT_FIT it is
+        rounding.
         """
         data = self.surface.data.measurements if self.surface.data.truth is None else self.surface.data.truth
         log_likelihood_of_number = top.total / np.count_nonzero(~np.isnan(data))
         log_size = np.log(np.nanmax(np.abs(data)))
-        if log_likelihood_of_number + log_size > EXACTLY:
+        if log_likelihood_of_number + log_size > EXACT_FIT:
             return "the likelihood grows for ever as variances fall to 0, for the network reproduces the data exactly"
         return ""
 
     def _evaluate_inwards_of_end(self, top: HighestPoint, index: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return points (INWARDS, p) from the end of a number's domain inwards, and how much higher l is there.
+        """Return points (points, p) from the end of a number's domain inwards, and how much higher l is at each.
 
-        `index`: coordinate of the number. `top`: the point at the end. INWARDS: distances from the end, 0 to 40 steps
-        of a logarithm or logit. The log-likelihood l counts as -inf where it is NaN.
+        `index`: coordinate of the number. `top`: the point at the end. DISTANCES_INWARDS: distances from the end, 0 to
+        40 steps of a logarithm or logit. The log-likelihood l counts as -inf where it is NaN.
         """
-        points = np.repeat(top.x[None], len(INWARDS), axis=0)
-        points[:, index] -= top.ends[index] * INWARDS
+        points = np.repeat(top.x[None], len(DISTANCES_INWARDS), axis=0)
+        points[:, index] -= top.ends[index] * DISTANCES_INWARDS
         return points, np.nan_to_num(self.surface.evaluations(points).total - top.total, nan=-np.inf)
 
 

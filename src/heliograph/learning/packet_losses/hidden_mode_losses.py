@@ -78,10 +78,16 @@ class HiddenModeLosses(AbstractLossLaw):
         return {name: getattr(self, name) for name in ("good_loss", "bad_loss", "fail", "recover")}
 
     def predicted(self, fate: Packets) -> Packets:
-        """Return the probability of each loss by the filter of the mode: P(lost) = sum_i P(mode i | past) loss_i."""
+        """Return the probability of each packet's loss (packets,), given the fates before it.
+
+        P(lost) = sum_i P(mode i | fates before) P(lost | mode i), by a filter of the two modes: a known fate changes
+        the probabilities of the modes by Bayes' rule, then the chain moves them to the next packet. `fate`: 0 arrived,
+        1 lost, NaN unknown.
+        """
         good, bad, fails, recovers = (share.estimate for share in self.shares().values())
         away = fails + recovers
-        is_bad = fails / away if away else 0.5  # two modes that never change: nobody knows which it is
+        # P(bad mode), from the stationary law on; of two modes that never change nobody knows which it is.
+        is_bad = fails / away if away else 0.5
         probabilities = np.zeros(len(fate))
         for k, observed in enumerate(fate.tolist()):
             p = (1 - is_bad) * good + is_bad * bad

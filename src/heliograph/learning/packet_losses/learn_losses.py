@@ -18,8 +18,8 @@ from heliograph.random_affine.base import AbstractRandomAffine
 
 INDEPENDENT, HIDDEN, RUNNING = "independent", "hidden", "running"  # names of laws
 
-LONG = 4  # packets back that the longer of the two chains looks
-LEVEL = 0.01  # probability that independent losses are said to have memory
+LONG_ORDER = 4  # packets back that the longer of the two chains looks
+TEST_LEVEL = 0.01  # probability that independent losses are said to have memory
 
 
 class HeldOutScores(NamedTuple):
@@ -170,13 +170,13 @@ def _find_significant_laws(laws: dict[str, AbstractLossLaw], parts: Fates) -> se
     """Return the names of the laws that a likelihood ratio test prefers to independent losses.
 
     Twice the gain of log-likelihood is chi-square if losses are independent, with a degree of freedom for each further
-    probability that a law has. All tests together have the level LEVEL (1 %).
+    probability that a law has. All tests together have the level TEST_LEVEL (1 %).
 
     Args:
         laws: fitted laws by name.
         parts: stretches of fates to which they were fitted.
     """
-    level = LEVEL / (len(laws) - 1)  # shared by the tests of all laws but "independent"
+    level = TEST_LEVEL / (len(laws) - 1)  # shared by the tests of all laws but "independent"
     total = {name: float(np.nansum(law.log_likelihoods(parts))) for name, law in laws.items()}
     significant = set[str]()
     for name, law in laws.items():
@@ -205,8 +205,8 @@ def _choose_law(significant: set[str], held_out: dict[str, HeldOutScores]) -> st
 def _fit_laws(parts: Fates, intervals: bool) -> dict[str, AbstractLossLaw]:
     """Return the five laws fitted to stretches of fates, by name; intervals of their numbers only if asked for.
 
-    One Markov law looks back over one packet, the other over LONG packets. HIDDEN has a good and a bad mode that are
-    not seen. RUNNING follows the share of losses as it drifts.
+    One Markov law looks back over one packet, the other over LONG_ORDER packets. HIDDEN has a good and a bad mode that
+    are not seen. RUNNING follows the share of losses as it drifts.
 
     Args:
         parts: stretches of fates: 0 arrived, 1 lost, NaN unknown.
@@ -215,7 +215,7 @@ def _fit_laws(parts: Fates, intervals: bool) -> dict[str, AbstractLossLaw]:
     return {
         INDEPENDENT: IndependentLosses.fit(parts),
         "markov": MarkovLosses.fit(parts, intervals=intervals),
-        f"markov_{LONG}": MarkovLosses.fit(parts, LONG),
+        f"markov_{LONG_ORDER}": MarkovLosses.fit(parts, LONG_ORDER),
         HIDDEN: HiddenModeLosses.fit(parts, intervals),
         RUNNING: RunningRateLosses.fit(parts, intervals),
     }

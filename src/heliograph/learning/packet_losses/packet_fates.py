@@ -19,11 +19,11 @@ class CheckedFates(Fates):
     """Stretches as `check_fates` gives them, with CHOSEN for ends that are no trials: they are not checked again."""
 
 
-JUMP = 200  # sequence numbers that leap so far ahead mean a restart, not of as many losses
+LEAST_JUMP = 200  # sequence numbers that leap so far ahead mean a restart, not of as many losses
 CHOSEN = 2.0  # of a packet that arrived, and is an end of its stretch for that reason
-COPY = 50  # a number received again may be a copy within so many
-FEW = 2  # numbers in a row that come again: more are those of a sender that restarted
-MOST = 2.0**53  # whole numbers up to here are doubles
+COPIES_WITHIN = 50  # a number received again may be a copy within so many
+FEW_COPIES = 2  # numbers in a row that come again: more are those of a sender that restarted
+LARGEST_NUMBER = 2.0**53  # whole numbers up to here are doubles
 
 
 class BetweenArrivals(np.ndarray):
@@ -65,7 +65,7 @@ def keep_ends_only(fate: np.ndarray) -> Float[np.ndarray, " packets"]:
 
 
 def fates_of_sequence(
-    sequence: "Float[ArrayLike, ' packets']", sent: "Float[ArrayLike, ' packets'] | None" = None, jump: int = JUMP
+    sequence: "Float[ArrayLike, ' packets']", sent: "Float[ArrayLike, ' packets'] | None" = None, jump: int = LEAST_JUMP
 ) -> Fates:
     """Return fates of the packets of one sender from the sequence numbers that were received: what is missing was lost.
 
@@ -92,7 +92,7 @@ def fates_of_sequence(
     numbers = array("sequence numbers", sequence, (None,))
     if not len(numbers) or np.any(numbers != np.round(numbers)):
         raise fail("sequence numbers", "whole numbers, at least one", "none" if not len(numbers) else "fractions")
-    if np.max(np.abs(numbers)) > MOST:
+    if np.max(np.abs(numbers)) > LARGEST_NUMBER:
         raise fail("sequence numbers", "numbers up to 2^53", f"{numbers[np.argmax(np.abs(numbers))]:g}")
     # In the order of sending where it is known: by time, then by number; equal pairs are copies, of which one stays.
     ordered = numbers.astype(np.int64)
@@ -135,16 +135,17 @@ def _are_copies(again: list[int], run: list[int], stretch: list[int]) -> bool:
     """Return whether repeated numbers at the beginning of a rising run are copies of packets received before.
 
     Else they are new packets of a sender that restarted its count. Example: after 5, 6, 7, 8 come 7, 8, 9. Then
-    `stretch` is [5, 6, 7, 8], `run` is [7, 8, 9] and `again` is [7, 8]. All must be among the last COPY numbers. At
-    most FEW are always copies. More are copies if everything from some number on comes again and the run then goes on,
-    as from a broker that missed the acknowledgements. This number may not be the first of the stretch.
+    `stretch` is [5, 6, 7, 8], `run` is [7, 8, 9] and `again` is [7, 8]. All must be among the last COPIES_WITHIN
+    numbers. At most FEW_COPIES are always copies. More are copies if everything from some number on comes again and the
+    run then goes on, as from a broker that missed the acknowledgements. This number may not be the first of the
+    stretch.
     """
-    lately = stretch[-COPY:]
+    lately = stretch[-COPIES_WITHIN:]
     if not set(again) <= set(lately):
         return False
     goes_on = len(run) > len(again)
     is_end_of_stretch = again[0] != stretch[0] and stretch[-len(again) :] == again
-    return len(again) <= FEW or (goes_on and is_end_of_stretch)
+    return len(again) <= FEW_COPIES or (goes_on and is_end_of_stretch)
 
 
 def _mark_gaps(received: np.ndarray) -> BetweenArrivals:

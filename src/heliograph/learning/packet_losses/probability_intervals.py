@@ -12,7 +12,7 @@ from heliograph.numerics.confidence_intervals import Share as Share
 FALL = 1.920729  # of the log-likelihood to the ends of a 95 % interval: half the 95 % point of chi-square(1)
 # The same where the maximum is at 0 or 1, as of an event that never came in n trials: (1 - p)^n = 5 %, n p ~ log 20.
 FALL_AT_END = 2.995732
-END = 14.0  # logits beyond are 0 and 1: shares of 8e-7
+FURTHEST_LOGIT = 14.0  # logits beyond are 0 and 1: shares of 8e-7
 FIRST_STEP = 0.25  # of a logit, from the maximum towards an end of an interval
 LOGIT_ACCURACY = 1e-3  # of an end
 PROFILE_ACCURACY = 1e-9  # relative, of a log-likelihood on a profile
@@ -25,7 +25,8 @@ def maximise_over_shares(
 ) -> tuple[np.ndarray, float]:
     """Return the highest point of a function of logits (p,), and its value there, by searches from several starts.
 
-    A logit is log(p / (1 - p)) of a share p. The search is bounded to logits between -END and END.
+    A logit is log(p / (1 - p)) of a share p. The search is bounded to logits between -FURTHEST_LOGIT and
+    FURTHEST_LOGIT.
 
     Args:
         function: returns the value and the gradient at logits (p,).
@@ -38,8 +39,8 @@ def maximise_over_shares(
         value, gradient = function(x)
         return -value, -gradient
 
-    # Logits beyond END are shares of 0 and 1, as far as data tell.
-    bounds = [(-END, END)] * len(starts[0])
+    # Logits beyond FURTHEST_LOGIT are shares of 0 and 1, as far as data tell.
+    bounds = [(-FURTHEST_LOGIT, FURTHEST_LOGIT)] * len(starts[0])
     results = [
         minimize(negative, x, jac=True, bounds=bounds, options={"ftol": precision, "gtol": 1e-7}) for x in starts
     ]
@@ -78,7 +79,7 @@ def _find_profile_interval(function: LogLikelihood, top: np.ndarray, value: floa
         i: index of the share.
     """
     # A logit near the bounds of the search means a share of 0 or 1, as far as the data tell.
-    is_zero, is_one = top[i] < 4 - END, top[i] > END - 4
+    is_zero, is_one = top[i] < 4 - FURTHEST_LOGIT, top[i] > FURTHEST_LOGIT - 4
     level = value - (FALL_AT_END if is_zero or is_one else FALL)
     low = 0.0 if is_zero else _find_profile_crossing(function, top, level, i, side=-1)
     high = 1.0 if is_one else _find_profile_crossing(function, top, level, i, side=1)
@@ -93,7 +94,7 @@ def _find_profile_crossing(function: LogLikelihood, top: np.ndarray, level: floa
 
     The profile at a logit is the log-likelihood, largest over all other logits. The crossing is an end of a confidence
     interval of the share, a probability 1 / (1 + exp(-logit)). 0 or 1 is returned where the profile stays above the
-    level up to the end of the domain, -END or END, on that side.
+    level up to the end of the domain, -FURTHEST_LOGIT or FURTHEST_LOGIT, on that side.
 
     Args:
         function: log-likelihood of the logits and its gradient.
@@ -123,10 +124,10 @@ def _find_profile_crossing(function: LogLikelihood, top: np.ndarray, level: floa
     inside, step = float(top[i]), FIRST_STEP
     if height_above_level(inside) <= 0:
         return float(expit(inside))
-    if height_above_level(side * END) >= 0:
+    if height_above_level(side * FURTHEST_LOGIT) >= 0:
         return 0.0 if side < 0 else 1.0
     # A bracket by doubled steps from the maximum, then Brent's method.
-    while height_above_level(outside := float(np.clip(inside + side * step, -END, END))) > 0:
+    while height_above_level(outside := float(np.clip(inside + side * step, -FURTHEST_LOGIT, FURTHEST_LOGIT))) > 0:
         inside, step = outside, 2 * step
     return float(expit(brentq(height_above_level, inside, outside, xtol=LOGIT_ACCURACY)))
 

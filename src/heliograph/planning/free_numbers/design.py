@@ -12,7 +12,7 @@ from heliograph.planning.free_numbers.problem import Build, FreeNumberProblem, r
 from heliograph.planning.network_from_design import repeat_network
 from heliograph.planning.power_budget import PowerLimits, make_budget, make_power_limits, make_unlimited
 from heliograph.planning.sequential_quadratic_programming import (
-    ACTIVE,
+    ACTIVE_ROOM,
     DescentProblem,
     PowerAndErrorLimits,
     ScaledProgramme,
@@ -186,9 +186,9 @@ def evaluate_lagrange_conditions(
     z = x / problem.unit
     value, gradient = programme.objective(z)
     # Normals of the limits that are reached: of powers (the target last) and of the ends of the numbers' ranges.
-    reached = programme.limit_room(z) < ACTIVE
+    reached = programme.limit_room(z) < ACTIVE_ROOM
     axes = np.eye(len(z))
-    at_low, at_high = x <= problem.low + ACTIVE * problem.unit, x >= problem.high - ACTIVE * problem.unit
+    at_low, at_high = x <= problem.low + ACTIVE_ROOM * problem.unit, x >= problem.high - ACTIVE_ROOM * problem.unit
     normals = [*programme.limit_room_slope(z)[reached], *axes[at_low], *-axes[at_high]]
     multipliers, residual = np.zeros(len(reached)), float(np.linalg.norm(gradient))
     if normals:

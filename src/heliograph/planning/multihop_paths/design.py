@@ -8,10 +8,10 @@ from heliograph.planning.multihop_paths.model import compute_path_information
 from heliograph.planning.multihop_paths.path_problem import PathProblem, PowerTask
 from heliograph.planning.multihop_paths.power_split_over_hops import SplitPaths
 from heliograph.planning.multihop_paths.water_filling import water_filling
-from heliograph.planning.power_budget import MET, Powers
+from heliograph.planning.power_budget import MET_EXCESS, Powers
 
-UNLIMITED = 1e13  # times alpha: more changes nothing but rounding
-REACHED = 1e-9  # relative: a target so near to what unlimited power leaves is not reached
+PLENTY = 1e13  # times alpha: more changes nothing but rounding
+REACH_MARGIN = 1e-9  # relative: a target so near to what unlimited power leaves is not reached
 FACTORS = 1e-12, 1e12  # by which a start is raised until it reaches a target
 BISECTIONS = 60
 
@@ -60,8 +60,9 @@ def find_least_total_powers(task: PowerTask, target: float) -> tuple[Powers, Cer
     if powers is None:
         raise fail("target error", "one that some start reaches (give more starts)", f"{target:.6g}")
     total = float(powers.mean(axis=0).sum())
-    if total > limits.total * (1 + MET):
-        least = find_least_error_powers(task)[1].value
+    if total > limits.total * (1 + MET_EXCESS):
+        _, certificate = find_least_error_powers(task)
+        least = certificate.value
         raise fail("target error", f"at least {least:.6g}, the least found within the budget", f"{target:.6g}")
     # The least total with which the error's tangent at these powers reaches the target. A convex error needs no less.
     bound = unlimited.problem.bound_least_total(powers, target)
@@ -130,7 +131,7 @@ def _raise_powers(problem: PathProblem, start: Powers, target: float) -> Powers 
 
 
 def _check_reachable(task: PowerTask, target: float) -> None:
-    """Raise ValueError unless the target exceeds, by the share REACHED, the error that all allowed power leaves.
+    """Raise ValueError unless the target exceeds, by the share REACH_MARGIN, the error that all allowed power leaves.
 
     Args:
         task: the error, the free hops and the limits of their powers.
@@ -138,11 +139,11 @@ def _check_reachable(task: PowerTask, target: float) -> None:
     """
     limits, alpha = task.problem.limits, task.problem.paths.alpha[:, task.free]
     has_limits = np.any(np.isfinite(limits.peak)) or np.any(np.isfinite(limits.mean))
-    # Each may send up to its peak, up to its mean power of all steps in one, and at most a lot of power (UNLIMITED).
-    plenty, whole_mean = UNLIMITED * np.maximum(alpha, 1.0), limits.mean * len(limits.peak)
+    # Each may send up to its peak, up to its mean power of all steps in one, and at most a lot of power (PLENTY).
+    plenty, whole_mean = PLENTY * np.maximum(alpha, 1.0), limits.mean * len(limits.peak)
     largest_powers = np.minimum(np.minimum(limits.peak, plenty), whole_mean)
     least_error = task.problem.compute_exact_error(largest_powers)
-    if target <= least_error * (1 + REACHED):
+    if target <= least_error * (1 + REACH_MARGIN):
         what = "power at its limits" if has_limits else "unlimited power"
         raise fail("target error", f"more than {least_error:.6g}: {what} leaves {least_error:.6g}", f"{target:.6g}")
 

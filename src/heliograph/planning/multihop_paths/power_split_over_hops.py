@@ -25,9 +25,9 @@ from heliograph.planning.multihop_paths.model import (
 
 NEWTON_STEPS = 60  # of the root in l, on a logarithmic scale on which Newton's steps cannot leave it
 BISECTIONS = 120  # of log l between ends: 2^-120 of their distance, 138, is far below its rounding
-ENDS = 1e-30, 1e30  # of l, times the largest alpha
-SETTLED = 1e-15  # relative change of log l at which Newton's steps end
-DEAD = 1e150  # noise of a path in which a hop that is not free sends nothing
+MULTIPLIER_ENDS = 1e-30, 1e30  # of l, times the largest alpha
+CONVERGED_STEP = 1e-15  # relative change of log l at which Newton's steps end
+DEAD_PATH_NOISE = 1e150  # noise of a path in which a hop that is not free sends nothing
 LARGEST = 1e100  # powers and noises, whose squares doubles hold
 
 Hops = Float[np.ndarray, "time path hops"]
@@ -67,7 +67,7 @@ def split_paths(paths: Paths, free: Bool[np.ndarray, "hop"], fixed: Powers) -> S
 
     A path's information is j = 1 / (A prod_h (1 + alpha_h / p_h) - t), with the product over its free hops. A (`full`)
     is s K prod (1 + alpha / p) over the hops of fixed power, s = E y^2 (`second`) and K the product of all kappa.
-    `fixed`: powers (time, hop). DEAD: the A of a path through a hop that sends nothing.
+    `fixed`: powers (time, hop). DEAD_PATH_NOISE: the A of a path through a hop that sends nothing.
     """
     full = paths.second * compute_path_kappas(paths)
     # Gather alpha of the free hops by path.
@@ -79,8 +79,10 @@ def split_paths(paths: Paths, free: Bool[np.ndarray, "hop"], fixed: Powers) -> S
     share = share_of_signal(fixed, paths.alpha)
     for h in np.flatnonzero(~free):
         i = paths.path[h]
-        full[:, i] = np.where(share[:, h] > 0, full[:, i] / np.maximum(share[:, h], 1 / DEAD), DEAD)
-    return SplitPaths(full=np.minimum(full, DEAD), signal=paths.signal, alpha=alpha)
+        full[:, i] = np.where(
+            share[:, h] > 0, full[:, i] / np.maximum(share[:, h], 1 / DEAD_PATH_NOISE), DEAD_PATH_NOISE
+        )
+    return SplitPaths(full=np.minimum(full, DEAD_PATH_NOISE), signal=paths.signal, alpha=alpha)
 
 
 def split_power(alpha: "Float[ArrayLike, ' H']", total: "Float[ArrayLike, '']") -> Float[np.ndarray, "H"]:
@@ -172,7 +174,7 @@ def _find_multiplier(alpha: Hops, power: np.ndarray) -> np.ndarray:
         # Newton's step: the slope of log(sum p) by log l is (d sum p / d log l) / sum p.
         step = np.divide(excess * total, negative_slope, out=np.zeros_like(total), where=negative_slope > 0)
         log_l = log_l + step
-        if np.all(np.abs(step) <= SETTLED * (1 + np.abs(log_l))):
+        if np.all(np.abs(step) <= CONVERGED_STEP * (1 + np.abs(log_l))):
             break
     return log_l
 
@@ -233,7 +235,7 @@ def compute_envelope(whole: SplitPaths, cap: PathValues) -> Envelope:
     """
     alpha, hops = whole.alpha, (whole.alpha > 0).sum(axis=-1)
     largest = np.where(hops > 0, alpha.max(axis=-1), 1.0)
-    low, high = (np.log(end / largest) for end in ENDS)
+    low, high = (np.log(end / largest) for end in MULTIPLIER_ENDS)
     for _ in range(BISECTIONS):
         middle = (low + high) / 2
         p = _split_at_multiplier(alpha, middle[..., None])[0]

@@ -17,11 +17,11 @@ from heliograph.planning.multihop_paths.path_problem import ErrorSlopes
 from heliograph.planning.multihop_paths.power_split_over_hops import SplitPaths
 from heliograph.planning.power_budget import PowerLimits, Powers
 
-CLOSED = 1e-14  # gap, of the error, at which the powers are the best but for rounding
-STEPS = 500
+CLOSED_GAP = 1e-14  # gap, of the error, at which the powers are the best but for rounding
+MOST_ITERATIONS = 500
 PATIENCE = 20  # iterations in a row that do not close the gap further
-TRIES = 12  # points on the way to other powers
-STEEPEST = 1e-9  # least a, of s kappa: below, a path that power makes free of noise is a little more than linear
+MOST_TRIES = 12  # points on the way to other powers
+LEAST_SLOPE = 1e-9  # least a, of s kappa: below, a path that power makes free of noise is a little more than linear
 
 
 def water_filling(
@@ -45,21 +45,21 @@ def water_filling(
         start: powers at which to begin (time, free).
     """
     # At the power p of its free hop, a path has j = p / (a p + b), with a = full - signal and b = full alpha.
-    a = np.maximum(whole.full - whole.signal, STEEPEST * whole.full)
+    a = np.maximum(whole.full - whole.signal, LEAST_SLOPE * whole.full)
     alpha = whole.alpha[..., 0]  # of the path's only free hop
     b = whole.full * alpha
-    # `best` are the powers with the least gap so far. A gap of CLOSED (1e-14) of the error is only rounding.
+    # `best` are the powers with the least gap so far. A gap of CLOSED_GAP (1e-14) of the error is only rounding.
     best = p = start
     least_gap, idle = np.inf, 0  # iterations in a row without a smaller gap
     slopes = slopes_at(p)
-    for _ in range(STEPS):
+    for _ in range(MOST_ITERATIONS):
         # The gap of Frank and Wolfe: how far the error's tangent at p falls within the limits. No powers gain more.
         least_on_tangent = limits.find_best_powers(-slopes.gradient)
         gap = float(np.sum(slopes.gradient * (p - least_on_tangent)))
-        idle = 0 if gap < (1 - CLOSED) * least_gap else idle + 1
+        idle = 0 if gap < (1 - CLOSED_GAP) * least_gap else idle + 1
         if gap < least_gap:
             least_gap, best = gap, p
-        if gap <= CLOSED * abs(slopes.error) or idle > PATIENCE:
+        if gap <= CLOSED_GAP * abs(slopes.error) or idle > PATIENCE:
             break
         # The powers that minimise -sum w j with the weights w = -d error / d j, and the best point on the way to them.
         filled = _fill_to_limits(limits, slopes.weights, a, b)
@@ -84,7 +84,7 @@ def _search_line(
     """
     slope = float(np.sum(slopes.gradient * way))
     length = 1.0
-    for _ in range(TRIES if slope < 0 else 0):
+    for _ in range(MOST_TRIES if slope < 0 else 0):
         tried = slopes_at(p + length * way)
         end_slope = float(np.sum(tried.gradient * way))
         if end_slope <= -0.5 * slope and tried.error <= slopes.error:
