@@ -215,7 +215,8 @@ def _read_date_ahead(origin: Origin, horizon: datetime | np.datetime64) -> tuple
     Raises:
         ValueError: a date that is missing or not after the data, or that 64 bits of nanoseconds cannot say.
     """
-    date, end = check_dates("horizons", [horizon])[0], _find_end_of_data(origin, horizon).astype("datetime64[ns]")
+    (date,) = check_dates("horizons", [horizon])
+    end = _find_end_of_data(origin, horizon).astype("datetime64[ns]")
     if not date > end:  # nor is NaT
         raise fail("horizons", f"dates after the data, which end at {end}", show_value(horizon))
     return date, end

@@ -83,7 +83,8 @@ def _forecast_from_each_row(
 
     start = jax.tree.map(jnp.asarray, filter.init())
     rows = jnp.arange(len(z)), jnp.asarray(z), jnp.asarray(u), jnp.asarray(windows)
-    return jax.lax.scan(filter_and_forecast, start, rows)[1]
+    _, forecasts = jax.lax.scan(filter_and_forecast, start, rows)
+    return forecasts
 
 
 _by_xla = quickly_compiled(_forecast_from_each_row)

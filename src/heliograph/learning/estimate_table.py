@@ -344,7 +344,8 @@ class Solution:
         """
         assert entry.coordinate is not None
         outward = self.top.ends[entry.coordinate]  # -1 or 1
-        first, drop = np.array([-outward * WAY_TO_END]), find_profile_drop(2 * level - 1)
+        first = np.array([-outward * WAY_TO_END])  # distance inwards at which the search begins
+        drop = find_profile_drop(2 * level - 1)
         (end,) = self._find_profile_ends(entry.coordinate, first, drop)
         limit = float(from_unconstrained(entry.domain, end if np.isfinite(end) else -outward * np.inf))
         return Row(

@@ -106,7 +106,7 @@ def identifiable(network: Build, inputs: ArrayLike | None = None, horizon: int =
     description = describe(network)
     description.start.check_sends_each_step("identifiability")
     # The filter's likelihood as a function of the free numbers.
-    objective = make_objectives(description)[-1]
+    *_, objective = make_objectives(description)  # the last form, which is the sharpest
     count = len(description.start.inputs)
     if inputs is None and count:
         raise fail("inputs", f"an array (steps, {count}) of {list(description.start.inputs)}", "none")
@@ -305,19 +305,21 @@ def _draw_measurements_by_innovations(objective: Objective, x: Array, u: Array, 
             zeros = reporting.with_numbers(zeros, numbers)
         # The innovation of z = 0 is -E z, with covariance S. Both are NaN for reported numbers, which get S = I and are
         # overwritten below.
-        received = filter.correct(prior, zeros, k)[1]
-        is_value = ~jnp.isnan(received.value)
-        S = jnp.where(is_value[:, None] & is_value, received.covariance, jnp.eye(len(zeros)))
+        _, innovation = filter.correct(prior, zeros, k)
+        is_value = ~jnp.isnan(innovation.value)
+        S = jnp.where(is_value[:, None] & is_value, innovation.covariance, jnp.eye(len(zeros)))
         # z = E z + L noise, with L L' = S.
-        z = cholesky(S) @ noise - received.value
+        z = cholesky(S) @ noise - innovation.value
         if reporting is not None:
             z = reporting.with_numbers(z, numbers)
-        return filter.correct(prior, z, k)[0], z
+        after, _ = filter.correct(prior, z, k)
+        return after, z
 
     start = jax.tree.map(jnp.asarray, filter.init())
     key_of_numbers = jax.random.fold_in(key, 1)
     noise = jax.random.normal(key, (len(u), filter.received), dtype=float)
-    measurements: jax.Array = jax.lax.scan(draw_row, start, (jnp.arange(len(u)), jnp.asarray(u), noise))[1]
+    measurements: jax.Array
+    _, measurements = jax.lax.scan(draw_row, start, (jnp.arange(len(u)), jnp.asarray(u), noise))
     return measurements
 
 

@@ -245,9 +245,8 @@ class Description:
         either side of the start, it is the network at the start.
         """
         start = self.parameters.start
-        away = DISTANCE_FROM_START * (
-            1 + np.modf(IRRATIONAL * np.arange(1, len(start) + 1))[0]
-        )  # different for each number
+        fractions, _ = np.modf(IRRATIONAL * np.arange(1, len(start) + 1))  # different for each number
+        away = DISTANCE_FROM_START * (1 + fractions)
         for direction in (1.0, -1.0):
             with suppress(ValueError):
                 return self.at_point(start + direction * away)

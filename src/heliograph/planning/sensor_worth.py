@@ -252,24 +252,30 @@ def _compute_squares_at_end(
 ) -> Float[np.ndarray, "runs n"]:
     """Return the squared error of each state after the last step of each run (runs, n), or if `exact` its variance.
 
-    `filter` runs over simulated measurements `z` with inputs `u`; `truth` has the true states. `exact`: its covariance
-    is true, so that variances are taken in place of squared errors, which scatter. If variances are the same in all
-    runs, only the first run is computed and returned (1, n).
+    If variances are the same in all runs, only the first run is computed and returned (1, n).
+
+    Args:
+        filter: the filter of all nodes.
+        z: simulated measurements (runs, steps, received), NaN where something is lost or left out.
+        u: inputs (steps, inputs).
+        truth: true states (runs, steps, n).
+        exact: whether the filter's covariance is true, so that variances are taken in place of squared errors, which
+            scatter.
     """
-    squares, used = [], filter.angles_used()
+    squares, angles = [], filter.angles_used()
     # Variances depend on which outputs arrive, and on gains or noise variances that are reported with each message
     # (`numbers`), not on measured values. If both are the same in all runs, so are the variances.
     reported = find_told_filter(filter)
     is_reported = np.isin(np.arange(z.shape[-1]), () if reported is None else reported.numbers)
     deciding = np.where(is_reported, z, np.isnan(z))
     alike = exact and np.array_equal(deciding, np.broadcast_to(deciding[:1], z.shape), equal_nan=True)
-    for row, x in zip(z, truth, strict=True):
-        filtered = filter.run(row, u)
+    for z_of_run, x in zip(z, truth, strict=True):
+        filtered = filter.run(z_of_run, u)
         if exact:
             squares.append(np.diagonal(filtered.covariances[-1]))
         else:
             # Errors of angles are within half a turn.
-            squares.append(wrap_angles(filtered.means[-1] - x[-1], used.states if used else ()) ** 2)
+            squares.append(wrap_angles(filtered.means[-1] - x[-1], angles.states if angles else ()) ** 2)
         if alike:
             break
     return np.array(squares)

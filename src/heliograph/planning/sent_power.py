@@ -384,5 +384,6 @@ def _draw_output_squares(
 
     start = at(plant, 0).sample_initial(key_of_start)
     rows = (jnp.arange(len(inputs)), jnp.asarray(inputs))
-    over_time: dict[str, jax.Array] = jax.lax.scan(draw_step, start, rows)[1]
+    over_time: dict[str, jax.Array]
+    _, over_time = jax.lax.scan(draw_step, start, rows)
     return over_time

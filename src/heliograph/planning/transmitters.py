@@ -58,7 +58,8 @@ def visit_hops(channel: AbstractRandomAffine, visit: Visit, signal: SignalMoment
     Raises:
         ValueError: a map of a kind whose transmitters are not known.
     """
-    return channel.visit_hops(visit, ChannelPosition("", 0, signal))[0]
+    visited, _ = channel.visit_hops(visit, ChannelPosition("", 0, signal))
+    return visited
 
 
 def transmitter_names(channel: AbstractRandomAffine) -> list[str]:

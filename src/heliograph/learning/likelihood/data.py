@@ -128,6 +128,7 @@ def _split_truth(network: Network, several: Sequence[object], truth: Any, steps:
     if len(listed) != len(several) or any(single is None for single in listed):
         got = "none" if truth is True else f"{len(listed)} of them"
         raise fail("truth", f"the true states of each of the {len(several)} recordings", got)
+    # States of a recording are (steps, n), or of several runs (runs, steps, n).
     runs = [
         run
         for of_recording in (np.asarray(fill_masked(single)) for single in listed)

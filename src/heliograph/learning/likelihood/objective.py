@@ -192,18 +192,20 @@ def _has_random_gain(network: Network) -> bool:
 
     Channels with a memory, and gains that the receiver knows, do not count: no average over gains is needed there.
     """
-    link = first(join_all_nodes(network)[-1])
+    _, _, channel = join_all_nodes(network)
+    link = first(channel)
     return not (link.remembers or link.past or link.has_known_gain) and has_random_gain(link, second_order(link))
 
 
 def list_forms(description: Description) -> list[Form]:
     """Return the forms of the likelihood that a network allows, "linear" before "conditional".
 
-    The linear form uses the unconditional moments of the state, the conditional form those given the data. `circular`:
-    whether there are angles. `link.past`: by how many steps packets may be late.
+    The linear form uses the unconditional moments of the state, the conditional form those given the data. Models that
+    are not linear, or have angles (`circular`), have only the conditional form; packets may then not be late
+    (`link.past`: by how many steps).
     """
     plant, sensor, channel = join_all_nodes(description.start)
-    link = first(channel)
+    link = first(channel)  # the channel of the first step, if it varies; its kind is the same at all
     if not is_linear(plant, sensor) or first(plant).circular or first(sensor).circular:
         if link.past:
             raise fail("network to be learned", "a linear plant and sensor behind links that are late", "others")

@@ -229,8 +229,11 @@ class MarkovLosses(AbstractLossLaw):
         """
         if self.order > 1:
             return super()._compute_return_probability(steps)
-        arrived, lost = np.array([0.0, np.nan]), np.array([1.0, np.nan])  # one known fate, and the one to predict
-        a, b = self.predicted(arrived)[1], 1 - self.predicted(lost)[1]
+        # P(lost) of the second of two packets, whose first arrived or was lost.
+        (_, lost_after_arrival), (_, lost_after_loss) = (
+            self.predicted(np.array([fate, np.nan])) for fate in (0.0, 1.0)
+        )
+        a, b = lost_after_arrival, 1 - lost_after_loss
         return float((b + a * (1 - a - b) ** steps) / (a + b))
 
     def channel(self, link: AbstractRandomAffine) -> AbstractRandomAffine:
@@ -284,7 +287,13 @@ def _condition_on_ends(counts: np.ndarray, spans: np.ndarray, intervals: bool) -
     # gradient. Over this width a difference is wrong by 1e-8 of it, and its rounding is 1e-12.
     width = 1e-4
     shifts = width * np.eye(2)
-    hessian = np.stack([likelihood(top - shift)[1] - likelihood(top + shift)[1] for shift in shifts]) / (2 * width)
+
+    def gradient_at(x: np.ndarray) -> np.ndarray:
+        """Return the gradient of the log-likelihood at logits x (2,)."""
+        _, gradient = likelihood(x)
+        return gradient
+
+    hessian = np.stack([gradient_at(top - shift) - gradient_at(top + shift) for shift in shifts]) / (2 * width)
     variances = np.diag(np.linalg.pinv((hessian + hessian.T) / 2))
     # n of each probability, and the equivalent counts [[n (1 - fail), n fail], [n recover, n (1 - recover)]].
     fail, recover = shares = 1 / (1 + np.exp(-top))

@@ -122,7 +122,8 @@ def _solve_periodic(system: ModeSystem) -> tuple[Parts, np.ndarray]:
         if np.abs(parts - previous).max() <= CONVERGED * np.abs(parts).max():
             break
         # The gains of step k follow from X after the step before it (the period's last for k = 0).
-        gains = np.array([_update_riccati(system, k, parts[k - 1])[0] for k in range(len(parts))])
+        updates = [_update_riccati(system, k, parts[k - 1]) for k in range(len(parts))]
+        gains = np.array([best_gains for best_gains, _ in updates])
     return parts, gains
 
 

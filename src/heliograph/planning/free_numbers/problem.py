@@ -215,8 +215,12 @@ class TracedNetwork:
     def make_system(self, x: Array) -> ModeSystem:
         """Return the system of the best linear filter if the free numbers have the values x (numbers,).
 
-        `self.young`: True if the scalar of Young's inequality is one of the numbers; it is not passed to the network.
-        UNTRACEABLE: errors of JAX if a function needs the value of a traced number.
+        JAX traces x to differentiate. A function that needs the value of a number (UNTRACEABLE) is refused. If a scalar
+        of Young's inequality is one of the numbers (`self.young`), it bounds the error, and is not passed to the
+        network.
+
+        Raises:
+            ValueError: a function that JAX cannot trace.
         """
         values = self.numbers.split_by_name(jnp.asarray(x))
         young = values.pop(YOUNG) if self.young else None

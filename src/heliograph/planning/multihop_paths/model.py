@@ -263,7 +263,8 @@ def _read_hop_numbers(
 
 def compute_path_kappas(paths: Paths) -> PathValues:
     """Return K (time, path), the product of kappa = E g^2 / (E g)^2 of the hops along each path."""
-    return np.asarray(_arrange_by_position(paths, paths.kappa)[0].prod(axis=-1))
+    kappas, _ = _arrange_by_position(paths, paths.kappa)  # (time, path, position along the path)
+    return np.asarray(kappas.prod(axis=-1))
 
 
 def _arrange_by_position(

@@ -138,19 +138,19 @@ def split_power_over_hops(whole: SplitPaths, total: PathValues) -> PowerSplit:
     hops = (alpha > 0).sum(axis=-1)  # number of a path's free hops with noise
     # The powers p_h(l), (time, path, hop), of exactly this sum.
     log_l = _find_multiplier(alpha, power)
-    p = _split_at_multiplier(alpha, log_l)[0]
+    p, _ = _split_at_multiplier(alpha, log_l)
     reached = p.sum(axis=-1, keepdims=True)
     p = p * np.divide(power, reached, out=np.ones_like(power), where=reached > 0)
     # j = (A / D) / (A - t A / D) and dj/dP = l D / (D - t)^2, in the ratio A / D, which vanishes with a power.
     ratio = share_of_signal(p, alpha).prod(axis=-1)
-    below = whole.full - whole.signal * ratio
+    denominator = whole.full - whole.signal * ratio  # A - t A / D
     sends = (total > 0) | (hops == 0)  # a path that needs no power is always there
-    slope = np.exp(log_l[..., 0]) * ratio * whole.full / below**2
+    slope = np.exp(log_l[..., 0]) * ratio * whole.full / denominator**2
     # Without power the information j is 0; its slope is 1 / (A alpha) with one hop, and 0 with several.
     slope_at_zero = np.divide(1.0, whole.full * alpha.sum(axis=-1), out=np.zeros_like(ratio), where=hops == 1)
     return PowerSplit(
         powers=np.where(sends[..., None], p, 0.0),
-        information=np.where(sends, ratio / below, 0.0),
+        information=np.where(sends, ratio / denominator, 0.0),
         slope=np.where(hops == 0, 0.0, np.where(sends, slope, slope_at_zero)),
     )
 
@@ -238,14 +238,14 @@ def compute_envelope(whole: SplitPaths, cap: PathValues) -> Envelope:
     low, high = (np.log(end / largest) for end in MULTIPLIER_ENDS)
     for _ in range(BISECTIONS):
         middle = (low + high) / 2
-        p = _split_at_multiplier(alpha, middle[..., None])[0]
+        p, _ = _split_at_multiplier(alpha, middle[..., None])
         noise = np.divide(alpha, p, out=np.zeros_like(p), where=p > 0)
         left_side = whole.full * np.prod(1 + noise, axis=-1) * (1 - p.sum(axis=-1) * np.exp(middle))
         is_above = left_side >= whole.signal
         low, high = np.where(is_above, middle, low), np.where(is_above, high, middle)
     # The power where the ray touches, at most the cap, and its slope j(P) / P.
-    touch = np.where(hops > 1, _split_at_multiplier(alpha, low[..., None])[0].sum(axis=-1), 0.0)
-    touch = np.minimum(touch, cap)
+    p, _ = _split_at_multiplier(alpha, low[..., None])
+    touch = np.minimum(np.where(hops > 1, p.sum(axis=-1), 0.0), cap)
     at_touch = split_power_over_hops(whole, touch)
     ray = np.divide(at_touch.information, touch, out=np.zeros_like(touch), where=touch > 0)
     return Envelope(whole, touch, ray)
