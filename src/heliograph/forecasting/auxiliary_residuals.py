@@ -228,22 +228,29 @@ def _smooth_noises(
     """
     steps, m = e.shape
     n = len(A)
-    output_mean, output_covariance = np.full((steps, m), np.nan), np.full((steps, m, m), np.nan)
-    plant_mean, plant_covariance = np.full((steps, n), np.nan), np.full((steps, n, n), np.nan)
+    output_mean = np.full((steps, m), np.nan)
+    output_covariance = np.full((steps, m, m), np.nan)
+    plant_mean = np.full((steps, n), np.nan)
+    plant_covariance = np.full((steps, n, n), np.nan)
     is_known = np.isfinite(P).all(axis=(1, 2))  # an unknown start has infinite variances
     first_known = int(np.argmax(is_known)) if is_known.any() else steps
     r, N = np.zeros(n), np.zeros((n, n))
     for k in reversed(range(first_known, steps)):
         arrived = np.flatnonzero(~np.isnan(e[k]))
-        C_k, R_k = C[arrived], R[np.ix_(arrived, arrived)]
+        C_k = C[arrived]
+        R_k = R[np.ix_(arrived, arrived)]
         S = C_k @ P[k] @ C_k.T + R_k
-        weighed, K = np.linalg.solve(S, e[k, arrived]), np.linalg.solve(S, C_k @ P[k]).T  # S^-1 e and K
+        # S^-1 e and K
+        weighed = np.linalg.solve(S, e[k, arrived])
+        K = np.linalg.solve(S, C_k @ P[k]).T
         output_mean[k, arrived] = R_k @ (weighed - K.T @ r)
         output_covariance[k][np.ix_(arrived, arrived)] = R_k @ (np.linalg.inv(S) + K.T @ N @ K) @ R_k
         B = np.eye(n) - K @ C_k
-        r, N = C_k.T @ weighed + B.T @ r, C_k.T @ np.linalg.solve(S, C_k) + B.T @ N @ B
+        r = C_k.T @ weighed + B.T @ r
+        N = C_k.T @ np.linalg.solve(S, C_k) + B.T @ N @ B
         plant_mean[k], plant_covariance[k] = Q @ r, Q @ N @ Q
-        r, N = A.T @ r, A.T @ N @ A
+        r = A.T @ r
+        N = A.T @ N @ A
     return (output_mean, output_covariance), (plant_mean, plant_covariance)
 
 

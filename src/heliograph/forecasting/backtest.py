@@ -185,7 +185,8 @@ def backtest(
     data = _Recording(measurements, inputs, time, truth)
     origins = [_find_start_of_forecasts(fitted, record, data) for fitted in networks.values()]
     # Networks have the same filters in the same order: the scores of each filter, as the networks have it in turn.
-    single_filters, scores = list_single_filters(network), list[Score]()
+    single_filters = list_single_filters(network)
+    scores = list[Score]()
     for filter_by_network in zip(*(list_targets(origin) for origin in origins), strict=True):
         target = filter_by_network[0]
         if (target.node, target.filter) in single_filters:

@@ -196,7 +196,8 @@ def _predict_without_nodes(network: Network, estimate: Estimate) -> tuple[Abstra
     with_claim = replace(filter, claim=claim)
     # `replace` does not copy `kept`, and the filter is frozen.
     object.__setattr__(with_claim, "kept", filter.kept)
-    mean, covariance = np.asarray(estimate.mean), np.asarray(estimate.covariance)
+    mean = np.asarray(estimate.mean)
+    covariance = np.asarray(estimate.covariance)
     if claim == "none":
         covariance = np.zeros_like(covariance)
     make_state = from_covariance if mean.ndim == 1 else _factor_each

@@ -330,7 +330,8 @@ def _place_on_clock(origin: Origin, distances: np.ndarray, continuous: bool) -> 
     # `check_dates` tests the sum with 2 s to spare, as the fractions of the end and of the distance are added last.
     seconds = np.minimum(spacing * distances, MOST_SECONDS_AHEAD)
     whole_seconds = np.floor(seconds)
-    last_second, spare = end.astype("datetime64[s]"), np.timedelta64(2, "s")
+    last_second = end.astype("datetime64[s]")
+    spare = np.timedelta64(2, "s")
     dates = last_second + whole_seconds.astype(np.int64).astype("timedelta64[s]")
     checked = check_dates("horizons", dates + spare) - spare
     fraction_of_end = end.astype("datetime64[ns]") - last_second

@@ -104,9 +104,11 @@ def make_prediction(
     means = wrap_near(means, means[..., :1, :], angles)  # within half a turn of the first part, to be averaged
     mean, covariance = _compute_mean_and_covariance(weights, means, covariances)
     if claim == "none":
-        covariance, variances = np.full_like(covariance, np.nan), np.full_like(variances, np.nan)
+        covariance = np.full_like(covariance, np.nan)
+        variances = np.full_like(variances, np.nan)
     # The law of each number by itself: of these parts, or that in `laws`, whose variances count where one is known.
-    law_weights, law_means = np.broadcast_to(weights[..., None], means.shape), means
+    law_weights = np.broadcast_to(weights[..., None], means.shape)
+    law_means = means
     if moments.laws is not None:
         law_weights, law_means, law_variances = map(np.asarray, moments.laws)
         law_means = wrap_near(law_means, mean[..., None, :], angles)

@@ -84,7 +84,8 @@ class MultistepPredictor(Module):
             return self._read_moments(filter, state)
         moments = self._read_moments(filter.base, filter.condition_on_limits(state))
         # The law of each limited state: Gaussians given the limits of the other states, later cut to its own limits.
-        means, variances = moments.means, jnp.diagonal(moments.covariances, axis1=-2, axis2=-1)
+        means = moments.means
+        variances = jnp.diagonal(moments.covariances, axis1=-2, axis2=-1)
         for i, *_ in filter.limits:
             given_other_limits = filter.condition_on_limits(filter.hold(state), without=i)
             moments_before_own_limit = self._read_moments(filter.base, given_other_limits)
@@ -237,7 +238,8 @@ class MultistepPredictor(Module):
         if not self.receives:
             return None
         innovation = _find_innovation_of_zero(self.filter, prior, k)
-        mean, covariance = -jnp.asarray(innovation.value), jnp.asarray(innovation.covariance)
+        mean = -jnp.asarray(innovation.value)
+        covariance = jnp.asarray(innovation.covariance)
         moments = Moments(weights=jnp.ones(1), means=mean[None], covariances=covariance[None])
         noise = self.received_noise
         if noise is None or outputs is None:

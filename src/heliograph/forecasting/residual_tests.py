@@ -124,7 +124,8 @@ def residuals(
     instance("filter", filter, AbstractFilter, "a filter, such as kalman_filter(...)")
     # Predict each row from those before it, then standardise and test; angles are compared within a turn.
     rows, inputs = check_data(filter, z, u)
-    predicted, count = predict_rows(filter, rows, inputs), check_count("lags", lags)
+    predicted = predict_rows(filter, rows, inputs)
+    count = check_count("lags", lags)
     angles = (filter.angles_used() or FilterAngles((), ())).received
     found = _standardise(predicted, np.asarray(rows), angles, count)
     if found is None:
@@ -242,7 +243,8 @@ def _test_normality(e: np.ndarray) -> float:
     if n < FEWEST_RESIDUALS:
         return float("nan")
     standardised = (e - e.mean()) / e.std()
-    S, K = np.mean(standardised**3), np.mean(standardised**4)
+    S = np.mean(standardised**3)
+    K = np.mean(standardised**4)
     return float(chi2.sf(n * (S**2 + (K - 3) ** 2 / 4) / 6, df=2))
 
 

@@ -113,14 +113,16 @@ def draw_paths(
     plant, sensor = target.predictor.plant, target.predictor.sensor
     if plant is None:
         raise fail("paths", "a filter that says what its plant is", type(target.predictor.filter).__name__)
-    count, key = check_count("draws", draws), jax.random.key(check_seed("seed", seed))
+    count = check_count("draws", draws)
+    key = jax.random.key(check_seed("seed", seed))
     # States and modes at the start, then states x and outputs y in all rows ahead, of which the horizons are kept.
     starts = _draw_initial_states(target, count, np.random.default_rng(seed))
     keys, step = jax.random.split(key, count), np.asarray(origin.step)
     learned = None  # deviations of the sensor's noise where the filter learns them
     if isinstance(adaptive := target.predictor.filter, AdaptiveFilter):
         learned = np.asarray(adaptive.noise_deviations(target.state, origin.step))
-    limits, switching = StateLimits(target.predictor.limits), _find_switching(target)
+    limits = StateLimits(target.predictor.limits)
+    switching = _find_switching(target)
     x, y = _draw_paths_from_states(plant, sensor, starts, ahead.u, keys, step, switching, learned, limits)
     return Paths(
         steps=ahead.steps,
@@ -178,7 +180,9 @@ class ModeSwitching(NamedTuple):
 
 def _find_switching(target: ForecastTarget) -> ModeSwitching | None:
     """Return how the modes of plant and sensor move, or None if these have no modes."""
-    filter, plant, sensor = target.predictor.filter, target.predictor.plant, target.predictor.sensor
+    filter = target.predictor.filter
+    plant = target.predictor.plant
+    sensor = target.predictor.sensor
     if not memories((plant, sensor)):
         return None
     if isinstance(filter, LimitedFilter):
@@ -263,7 +267,8 @@ def _draw_paths_from_states(
         (x, mode), (u_k, k) = before, row
         key_of_row = jax.random.fold_in(key, k)
         key_of_plant, key_of_sensor = jax.random.split(key_of_row)
-        plant_k, sensor_k = at(plant, k), None if sensor is None else at(sensor, k)
+        plant_k = at(plant, k)
+        sensor_k = None if sensor is None else at(sensor, k)
         if switching is not None:
             key_of_mode = jax.random.fold_in(key_of_row, 2)  # 0 and 1 may be the keys of plant and sensor
             mode = switching.draw_next(key_of_mode, mode, u_k, k, is_first=k == jnp.asarray(step))

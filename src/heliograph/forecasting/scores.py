@@ -91,7 +91,8 @@ def log_score(law: MixtureLaws, values: np.ndarray) -> np.ndarray:
     """
     squares = _standardise(values[:, None] - law.means, law.variances) ** 2
     with np.errstate(divide="ignore"):  # a part may have weight 0, or variance 0
-        log_weights, log_variances = np.log(law.weights), np.log(law.variances)
+        log_weights = np.log(law.weights)
+        log_variances = np.log(law.variances)
     # An infinite square is no density, however small the variance.
     log_terms = log_weights - (squares + np.where(np.isinf(squares), 0.0, log_variances) + LOG_TURN) / 2
     largest = log_terms.max(axis=1)
@@ -125,7 +126,8 @@ def _compute_distance_of_two(law: MixtureLaws) -> np.ndarray:
     """Return E|X - X'| of independent X and X' of each row's law (rows,); each pair of parts counts twice."""
     total = np.zeros(len(law.weights))
     for i in range(law.weights.shape[1]):
-        differences, variances = law.means[:, [i]] - law.means[:, i:], law.variances[:, [i]] + law.variances[:, i:]
+        differences = law.means[:, [i]] - law.means[:, i:]
+        variances = law.variances[:, [i]] + law.variances[:, i:]
         pairs = law.weights[:, [i]] * law.weights[:, i:] * _compute_mean_size(differences, variances)
         total += pairs[:, 0] + 2 * pairs[:, 1:].sum(axis=1)
     return total
@@ -165,11 +167,13 @@ def average_overlapping(values: np.ndarray, horizon: int) -> ScoreMean:
         return ScoreMean(mean, float("nan"))
     lags = min(max(horizon - 1, int(BANDWIDTH * n**0.5)), len(values) - 1)
     # W and S as functions of the lag, and the vector of ones.
-    bartlett, overlap = _fall_over_lags(lags + 1), _fall_over_lags(horizon)
+    bartlett = _fall_over_lags(lags + 1)
+    overlap = _fall_over_lags(horizon)
     one = came.astype(float)
     # E[d' W d] = tr(M W M S) with M = I - 1 1' / n over the rows that are not NaN, which `one` marks by ones:
     # tr(W S) + (1' W 1) (1' S 1) / n^2 - 2 / n 1' W S 1.
-    W_one, S_one = _weigh_neighbours(one, bartlett), _weigh_neighbours(one, overlap)
+    W_one = _weigh_neighbours(one, bartlett)
+    S_one = _weigh_neighbours(one, overlap)
     one_W_one, one_S_one = one @ W_one, one @ S_one
     shortest = min(len(bartlett), len(overlap))
     expected = one @ _weigh_neighbours(one, bartlett[:shortest] * overlap[:shortest])  # tr(W S) = sum of W_ij S_ij

@@ -230,7 +230,8 @@ class Solution:
         """
         covariance, freedom = self.covariance("hessian" if method == "profile" else method)
         # Estimates at the maximum, and their derivatives by the active coordinates x (logarithms, logits or numbers).
-        values, slopes = self.parameters.entries_at(self.x), self.parameters.slopes(self.top.x)[:, self.active]
+        values = self.parameters.entries_at(self.x)
+        slopes = self.parameters.slopes(self.top.x)[:, self.active]
         rows = []
         for entry, value, slope in zip(self.parameters.entries, values, slopes, strict=True):
             error = float(np.sqrt(max(slope @ covariance @ slope, 0.0)))

@@ -126,7 +126,8 @@ def _maximise_forms(
     Raises:
         KeyboardInterrupt: Ctrl-C before there was a first point; after it the best point so far is returned.
     """
-    ends, solutions = np.zeros(0), list[Solution]()
+    ends = np.zeros(0)
+    solutions = list[Solution]()
     for surface in surfaces:
         search = MaximumSearch(surface, _make_climb_reporter(surface, progress))
         try:
@@ -219,7 +220,8 @@ def _make_climb_reporter(surface: LikelihoodSurface, say: Progress) -> Callable[
 
     def report(climbs: ClimbEnds) -> None:
         """Say which step the climbs are at, how many have converged, and the highest log-likelihood so far."""
-        best, done = np.nanmax(climbs.total), int(climbs.converged.sum())
+        best = np.nanmax(climbs.total)
+        done = int(climbs.converged.sum())
         say(f"{form}: step {climbs.steps}, {done} of {len(climbs.x)} starts done, {best:.6g}")
 
     return report

@@ -253,7 +253,8 @@ def _format_interval(
     if solution is None or not all(solution.active[i] for i in group.coordinates):
         return ""
     # The value sum_i a_i v_i, or sum_i a_i log |v_i|, and its slopes by the unconstrained coordinates.
-    jacobian, values = parameters.jacobian(solution.x), parameters.entries_at(solution.x)
+    jacobian = parameters.jacobian(solution.x)
+    values = parameters.entries_at(solution.x)
     slopes, value = np.zeros(len(solution.x)), 0.0
     for entry, slope, number in zip(parameters.entries, jacobian, values, strict=True):
         if entry.coordinate in group.coordinates:
@@ -297,7 +298,8 @@ def _draw_measurements_by_innovations(objective: Objective, x: Array, u: Array, 
     def draw_row(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, jax.Array]:
         """Return the filter's state after row k, and the measurement drawn for it."""
         k, u_k, noise = row
-        prior, zeros = filter.predict(state, u_k, k), jnp.zeros(filter.received)
+        prior = filter.predict(state, u_k, k)
+        zeros = jnp.zeros(filter.received)
         # Draw the reported numbers first: the law of the other components depends on them.
         numbers = jnp.zeros(0)
         if reporting is not None:

@@ -35,9 +35,8 @@ Method = Literal["cosines", "bartlett", "white", "hessian", "bootstrap", "profil
 METHODS = get_args(Method)
 LEVEL = 0.95
 BOOTSTRAP_DRAWS = 999  # of the bootstrap
-FEW_STRETCHES = (
-    1 / 3
-)  # share of the data in which the information on a number lies, below which scores do not tell its spread
+# Share of the data in which the information on a number lies, below which scores do not tell its spread.
+FEW_STRETCHES = 1 / 3
 
 Scores = list[Float[np.ndarray, "steps p"]]
 

@@ -23,10 +23,8 @@ from heliograph.simulation.network import Network
 Kind = Literal["real", "positive", "probability", "simplex", "covariance"]
 Build = TypeAliasType("Build", Callable[[], Network])  # a function that returns a network
 
-DISTANCE_FROM_START, IRRATIONAL = (
-    0.1,
-    0.6180339887498949,
-)  # unconstrained distance of a point near the start; multiples of it differ
+DISTANCE_FROM_START = 0.1  # unconstrained distance of a point near the start
+IRRATIONAL = 0.6180339887498949  # fractions of its multiples are all different
 
 DOMAINS: dict[Kind, Domain] = {
     "real": REAL,

@@ -84,7 +84,8 @@ def samples_to_tell(
     u = np.zeros((steps, len(network.inputs))) if inputs is None else np.asarray(inputs, dtype=float)
     # Mean I and long-run deviation sqrt V of the log-likelihood ratio per step, where either law is true.
     channels = [_replace_law(node.channel, (law_a, law_b), law) for law in (law_a, law_b)]
-    means, deviations = list[float](), list[float]()
+    means = list[float]()
+    deviations = list[float]()
     any_filter = {"open_loop": open_loop_filter(network.plant)}  # of the runs only the measurements are used
     for true, other in (channels, channels[::-1]):
         # Measurements z (runs, steps, received) under the true law, and log p_true - log p_other of each (runs, steps).

@@ -344,7 +344,9 @@ class _Profile(NamedTuple):
         The distance is doubled until the profile is below the level, or beyond FURTHEST_END, where an interval counts
         as without an end; then it is found by bisection, to END_ACCURACY.
         """
-        inside, outside = 0.0, FIRST_REACH  # distances at which the profile is above and below the level
+        # distances at which the profile is above and below the level
+        inside = 0.0
+        outside = FIRST_REACH
         nearby = _ProfilePoint(top[self.coordinate], np.delete(top, self.coordinate))
         while outside < FURTHEST_END:
             is_above, nearby = self.is_above_level(top[self.coordinate] + side * outside, nearby)

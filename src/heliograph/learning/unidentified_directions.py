@@ -84,7 +84,8 @@ def find_confounded(
     fewest = min(rank.flat.shape[1] for rank in ranks)
     if not fewest:
         return []
-    of_logs, of_numbers = [], []  # flat directions at each point, in columns
+    of_logs = []
+    of_numbers = []  # flat directions at each point, in columns
     for x, rank in zip(points, ranks, strict=True):
         if rank.flat.shape[1] == fewest:
             # dv/dx and d log |v| / dx (p,) scale the rows of the flat directions, which `unit` takes to coordinates x.
@@ -104,7 +105,8 @@ def _differentiate_coordinates(parameters: Parameters, x: Float[np.ndarray, " p"
         parameters: the free numbers.
         x: the point in unconstrained coordinates (p,).
     """
-    slopes, log_slopes = np.ones(len(x)), np.ones(len(x))
+    slopes = np.ones(len(x))
+    log_slopes = np.ones(len(x))
     for entry, dv_dx, v in zip(parameters.entries, parameters.jacobian(x), parameters.entries_at(x), strict=True):
         i = entry.coordinate
         if i is not None:

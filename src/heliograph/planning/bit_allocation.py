@@ -143,7 +143,8 @@ def _collect_plant_and_senders(network: Network) -> _PlantAndSenders:
     a, q = np.asarray(plant.matrix), np.asarray(plant.noise.covariance)
     if spectral_radius(a) >= 1:
         raise fail("plant of a design of bits", expected, f"one of spectral radius {spectral_radius(a):.3g}")
-    rows, information = list[np.ndarray](), list[np.ndarray]()
+    rows = list[np.ndarray]()
+    information = list[np.ndarray]()
     for name, node in network.nodes.items():
         if not isinstance(node, Node) or node.encoder is None or len(node.outputs) != 1:
             raise fail(f"node {name!r} of a design of bits", "one with an encoder and one output", "another")
@@ -293,7 +294,8 @@ def _bound_by_relaxation(senders: _PlantAndSenders, total: int) -> float:
     hulls = [_find_envelope(values) for values in senders.information]
     j, bound = np.zeros(len(hulls)), -np.inf
     for k in range(RELAXATION_STEPS):
-        slopes, error = _compute_error_slopes(senders, j), _compute_steady_error(senders, j)
+        slopes = _compute_error_slopes(senders, j)
+        error = _compute_steady_error(senders, j)
         best_on_tangent = _spend_bits(hulls, -slopes, total)
         least_on_tangent = error - float(slopes @ (j - best_on_tangent))
         bound = max(bound, least_on_tangent)
@@ -333,7 +335,8 @@ def _spend_bits(hulls: list[list[tuple[int, float]]], worth: np.ndarray, total: 
         for i, hull in enumerate(hulls)
         for (a, low), (b, high) in pairwise(hull)
     ]
-    j, left = np.zeros(len(hulls)), float(total)
+    j = np.zeros(len(hulls))
+    left = float(total)
     for _, sender, bits, information in sorted(edges, reverse=True):
         share = min(1.0, left / bits)
         j[sender] += share * information

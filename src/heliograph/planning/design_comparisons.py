@@ -121,7 +121,8 @@ def error_over_sites(
     # Check the design, the function and the places.
     instance("design", best, PowerDesign, "a PowerDesign")
     function("network of a map", build, "x and y")
-    columns, rows = array("x of a map", x, (None,)), array("y of a map", y, (None,))
+    columns = array("x of a map", x, (None,))
+    rows = array("y of a map", y, (None,))
     # The design is made again at each place. A few starts are enough, since errors are only compared.
     problem = best.problem.replace_total(best.total)
     problem = replace(problem, starts=min(problem.starts, SITE_STARTS))
@@ -240,7 +241,9 @@ def _list_relays(
         name: name of the node whose hops get a relay.
         exponent: exponent of the path loss: power falls as distance^-exponent.
     """
-    node, problems, free = nodes[name], dict[str, DesignProblem](), _list_free_names(problem)
+    node = nodes[name]
+    problems = dict[str, DesignProblem]()
+    free = _list_free_names(problem)
     assert isinstance(node.channel, AbstractRandomAffine)
     free_nodes = None if free is None else tuple(dict.fromkeys(_find_node_of_transmitter(each) for each in free))
     hops = transmitter_names(node.channel)

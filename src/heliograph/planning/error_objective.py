@@ -11,12 +11,8 @@ from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import ArrayLike, Float
 
 WEIGHT = "weight of the error"
-SHARPNESSES = (
-    16,
-    128,
-    2048,
-    32768,
-)  # smoothing of the largest eigenvalue, less and less: n^(1/32768) is left at the end
+# Smoothing of the largest eigenvalue, less and less: n^(1/32768) is left at the end.
+SHARPNESSES = (16, 128, 2048, 32768)
 
 Matrices = Float[np.ndarray, "time n n"]
 

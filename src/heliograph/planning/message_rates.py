@@ -119,7 +119,8 @@ def prediction_error_rate(plant: AnyPlant, sensor: AnySensor, delta: float, loss
     """
     system = _require_scalar_system(plant, sensor)
     a, q, c, r = system
-    delta, loss = float(scalar("delta", delta, TINY)), float(scalar("loss", loss, 0.0, 1.0))
+    delta = float(scalar("delta", delta, TINY))
+    loss = float(scalar("loss", loss, 0.0, 1.0))
     if loss == 1:
         raise fail("loss", "a number below 1", loss)
     posterior = system.kalman_variance
@@ -198,7 +199,8 @@ def _send_on_delta_rate(system: ScalarSystem, delta: float) -> float:
     if not abs(system.a) < 1:
         raise fail("plant", "a stable one, which has a rate in the long run", f"a = {system.a:g}")
     # Change to the unit of the state, so that c is 1.
-    delta, system = delta / abs(system.c), system._replace(c=1.0, r=system.r / system.c**2)
+    delta = delta / abs(system.c)
+    system = system._replace(c=1.0, r=system.r / system.c**2)
     coarse = compute_rate_on_grid(system, delta, share=0.8)
     fine = compute_rate_on_grid(system, delta, share=0.5)
     if fine.rate == coarse.rate:  # if nothing is ever sent, both grids say 0

@@ -131,7 +131,8 @@ def _design_powers(problem: DesignProblem) -> PowerDesign:
         limits = make_unlimited(error.steps, int(free.sum()))
     else:
         limits = make_power_limits(make_budget(problem.budget), paths.names, free, present_powers)
-    starts, seed = check_count("starts", problem.starts), check_seed("seed", problem.seed)
+    starts = check_count("starts", problem.starts)
+    seed = check_seed("seed", problem.seed)
     # A target error, or None: then the least error within the budget is sought.
     target = None if problem.target_error is None else float(scalar("target error", problem.target_error, 0.0))
     task = make_power_task(paths, error.criterion(states), limits, free, present_powers, starts, seed)

@@ -122,7 +122,8 @@ def worth_of_sensors(
             or additions with triggers, words or feedback, relays that filter, a single run.
     """
     instance("network", network, Network, "a Network")
-    nodes, added = _require_plain_nodes(network), table("additions", additions or {}, "nodes")
+    nodes = _require_plain_nodes(network)
+    added = table("additions", additions or {}, "nodes")
     if taken := [name for name in added if name in nodes]:
         raise fail("additions", "nodes of other names than the network's", taken[0])
     check_count("steps", steps)
@@ -136,7 +137,8 @@ def worth_of_sensors(
     # Of fewer than two runs no spread is known.
     drawn = monte_carlo(Network(network.plant, bare), steps, check_count("runs", runs, 2), key, inputs=inputs)
     u = np.zeros((steps, 0)) if inputs is None else np.asarray(inputs, float)
-    z, truth = np.concatenate([drawn.measurements[name] for name in bare], axis=-1), np.asarray(drawn.truth)
+    z = np.concatenate([drawn.measurements[name] for name in bare], axis=-1)
+    truth = np.asarray(drawn.truth)
     # The error of each case, in which what is not used is NaN. The first case is that of all nodes.
     sizes = [bare[name].received for name in bare]
     errors: list[ErrorWithout] = []

@@ -259,7 +259,10 @@ def _compute_innovation_moments(
     if horizon is None or filter.claim != "exact":
         expected = "a horizon and a linear model, whose filter knows its error before any data"
         raise fail("power of a sensor with feedback", expected, "no horizon" if horizon is None else filter.claim)
-    model, state, moments = filter.assumed, filter.init(), []  # the filter's model of plant and sensor
+    # the filter's model of plant and sensor
+    model = filter.assumed
+    state = filter.init()
+    moments = []
     assert model is not None and model.sensor is not None  # since it predicts a measurement
     for k, u in enumerate(inputs):
         state = filter.predict(state, u, k)
@@ -293,7 +296,8 @@ def _compute_relay_powers(network: Network, horizon: int | None) -> dict[str, Fl
     moved = relays.steps(steps)
     # The schedule's A and B have to be the plant's A and the rows of B that the relay expects. `expected_rows` has the
     # rows of all filters one after another, and those of a filter end at its entry of `ends`.
-    expected_rows, n = moved.predict_maps()[0], len(relays.states)
+    expected_rows = moved.predict_maps()[0]
+    n = len(relays.states)
     ends = dict(zip(relays.filters, np.cumsum(relays.received), strict=True))
     # What relays send does not depend on the receiver, whose gains may be zero; it is the last of `relays.received`.
     gains = {RECEIVER: np.zeros((steps, n, relays.received[-1]))}

@@ -17,10 +17,8 @@ from heliograph.numerics.types import Bool, Float
 Vector = Float[np.ndarray, "x"]
 
 MOST_ITERATIONS = 400
-FINE_TOLERANCE, COARSE_TOLERANCE = (
-    1e-14,
-    1e-8,
-)  # relative change at which a descent ends, and that of many of which the best goes on
+FINE_TOLERANCE = 1e-14  # relative change at which a descent ends
+COARSE_TOLERANCE = 1e-8  # that of many descents, of which only the best goes on
 MOST_ROUNDS = 4  # of a descent begun again where it ended, its Hessian forgotten, and of Newton's method
 FEASIBLE_EXCESS = 1e-7  # relative excess over a limit that counts as none
 ACTIVE_ROOM = 1e-7  # relative: how near a limit is one that is reached
@@ -156,7 +154,8 @@ class ScaledProgramme:
         if self.limits.target is None:
             return ValueAndSlope(evaluation.error / self.size, evaluation.error_slope * unit / self.size)
         scale = self.limits.steps * self.size
-        total, total_slope = float(evaluation.powers.sum()), evaluation.power_slope.sum(axis=0)
+        total = float(evaluation.powers.sum())
+        total_slope = evaluation.power_slope.sum(axis=0)
         return ValueAndSlope(total / scale, total_slope * unit / scale)
 
     def limit_room(self, z: Vector) -> Float[np.ndarray, "limits"]:
@@ -165,7 +164,9 @@ class ScaledProgramme:
         Limits are scaled to 1 (or 0), so the parts are 1 - powers / limit, and 1 - error / target. All are -1 at a
         point without an evaluation, where the error grows without limit.
         """
-        rows, most, target = self.limits.rows, self.limits.most, self.limits.target
+        rows = self.limits.rows
+        most = self.limits.most
+        target = self.limits.target
         evaluation = self.evaluate_at(z)
         if evaluation is None:
             return np.full(len(most) + (target is not None), -1.0)
@@ -177,7 +178,9 @@ class ScaledProgramme:
 
         They are 0 at a point without an evaluation, where the error grows without limit.
         """
-        rows, most, target = self.limits.rows, self.limits.most, self.limits.target
+        rows = self.limits.rows
+        most = self.limits.most
+        target = self.limits.target
         evaluation = self.evaluate_at(z)
         unit = self.problem.unit
         if evaluation is None:
@@ -280,9 +283,8 @@ class ScaledProgramme:
         of the active limits' room, and the Hessian H of the Lagrangian, value - m' room. None is returned where all
         variables are at bounds, or derivatives are not finite.
         """
-        index = np.flatnonzero(
-            (z > self.bounds.lb + ACTIVE_ROOM) & (z < self.bounds.ub - ACTIVE_ROOM)
-        )  # variables at no bound
+        is_at_no_bound = (z > self.bounds.lb + ACTIVE_ROOM) & (z < self.bounds.ub - ACTIVE_ROOM)
+        index = np.flatnonzero(is_at_no_bound)
         room = self.limit_room(z)
         active = room <= ACTIVE_ROOM
         if not len(index):
@@ -327,10 +329,12 @@ class ScaledProgramme:
 
             m are the `multipliers` of the `active` limits.
             """
-            gradient, slopes = self.objective(point).slope, self.limit_room_slope(point)[active]
+            gradient = self.objective(point).slope
+            slopes = self.limit_room_slope(point)[active]
             return np.asarray((gradient - multipliers @ slopes)[index] * scale)
 
-        at_z, hessian = lagrangian_gradient(z), np.empty((len(index), len(index)))
+        at_z = lagrangian_gradient(z)
+        hessian = np.empty((len(index), len(index)))
         for column, variable in enumerate(index):
             shift = np.zeros_like(z)
             shift[variable] = DIFFERENCE_WIDTH * scale[column]
@@ -348,7 +352,8 @@ def search_from_starts(problem: DescentProblem, limits: PowerAndErrorLimits, sta
         limits: of powers, and of the error where there is a target.
         starts: points x, in the problem's own units.
     """
-    points, sharpest = [start / problem.unit for start in starts], problem.sharpnesses[-1]
+    points = [start / problem.unit for start in starts]
+    sharpest = problem.sharpnesses[-1]
     # Coarse descents from everywhere, the largest eigenvalue sharper and sharper.
     for sharpness in problem.sharpnesses if len(points) > 1 else problem.sharpnesses[:-1]:
         programmes = [ScaledProgramme(problem, limits, sharpness, z * problem.unit) for z in points]

@@ -156,7 +156,8 @@ class SumOfLinksTask(NamedTuple):
         for point in points:
             result = scipy.optimize.minimize(error_at, point, method="L-BFGS-B", bounds=[(-1.0, 1.0)] * len(scale))
             if result.fun < least:
-                best, least = amplitudes_at(np.asarray(result.x)), float(result.fun)
+                best = amplitudes_at(np.asarray(result.x))
+                least = float(result.fun)
         return best
 
 
@@ -225,7 +226,8 @@ def _make_task(
     if problem.budget is not None:
         sent = links.present**2 * links.unit
         limits = make_power_limits(make_budget(problem.budget), names, free, sent[None])
-    transition, noise = np.asarray(plant.matrix), np.asarray(process.covariance)
+    transition = np.asarray(plant.matrix)
+    noise = np.asarray(process.covariance)
     criterion = problem.criterion.criterion(plant.states)
     return SumOfLinksTask(
         links=links,

@@ -53,7 +53,8 @@ def smooth_in_chunks(filter: Any, z: Array, u: Array) -> SmoothedRows | None:
         z: measurements (rows, received), NaN for what did not arrive.
         u: inputs (rows, inputs).
     """
-    start, rows = initial_state_if_linear(filter), (np.asarray(z), np.asarray(u))
+    start = initial_state_if_linear(filter)
+    rows = (np.asarray(z), np.asarray(u))
     if start is None:
         return None
     with jax.enable_x64(True):
@@ -149,7 +150,8 @@ def _smooth_all(recursion: SmootherStepRecursion, chunk_starts: ChunkStarts, row
         first = chunk_starts.first[which]
         is_given = np.full(len(first), later is not None)
         if later is None:
-            pass_back_from, laws = window_ends[which], gaussian_of(states)  # these laws are not used
+            pass_back_from = window_ends[which]
+            laws = gaussian_of(states)  # these laws are not used
         else:
             pass_back_from, laws = first + own, later
         arguments = recursion, states, take(windows, which), first, pass_back_from, laws, is_given
@@ -201,12 +203,15 @@ def _resmooth_wrong_ends(smooth: SmoothChunks, states: PyTree, results: Smoothed
         states: states with which the chunks began (chunks, ...).
         results: results of all chunks (chunks, ...).
     """
-    laws_at_ends, laws_at_starts = take(results.law_after, slice(None, -1)), take(results.law_before, slice(1, None))
+    laws_at_ends = take(results.law_after, slice(None, -1))
+    laws_at_starts = take(results.law_before, slice(1, None))
     disagrees_with_next = ~find_equal_states(laws_at_ends, laws_at_starts)
     for c in range(len(disagrees_with_next) - 1, -1, -1):
         if not disagrees_with_next[c]:
             continue
-        previous_chunk, chunk, next_chunk = slice(c - 1, c), slice(c, c + 1), slice(c + 1, c + 2)
+        previous_chunk = slice(c - 1, c)
+        chunk = slice(c, c + 1)
+        next_chunk = slice(c + 1, c + 2)
         state = take(results.end, previous_chunk) if c else take(states, chunk)
         replace_chunk(results, chunk, smooth(state, chunk, take(results.law_before, next_chunk)))
         if c:

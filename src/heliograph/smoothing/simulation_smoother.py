@@ -101,7 +101,8 @@ def _draw_path_back(steps: SmootherStep, key: jax.Array) -> jax.Array:
         return x, _take_plant_state(previous, x)
 
     # The last state, then back over pairs of successive steps, each with a key of its own.
-    last, keys = take_step(steps, -1), jax.random.split(key, len(steps.mean))
+    last = take_step(steps, -1)
+    keys = jax.random.split(key, len(steps.mean))
     end = last.manifold.settle(last.after.mean, _draw_gaussian(last.after, keys[-1]))
     pairs = take_steps(steps, slice(None, -1)), take_steps(steps, slice(1, None)), keys[:-1]
     _, earlier = jax.lax.scan(body, end, pairs, reverse=True)

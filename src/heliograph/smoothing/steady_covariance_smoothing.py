@@ -167,7 +167,9 @@ def _smooth_settled(
         rows: measurements and inputs (rows, ...) of the chunk and of some rows after it.
         first: number of the chunk's first row.
     """
-    own, settled, end = recursion.own, back.settled, first + len(rows[0])
+    own = recursion.own
+    settled = back.settled
+    end = first + len(rows[0])
     # Steps are the leaves of smoother steps that depend on data, of the own rows and of those after them.
     means_at_end, steps = scan_settled_rows(recursion, settled, means, take(rows, slice(own)), first, end)
     rows_after = take(rows, slice(own, None))
@@ -175,7 +177,8 @@ def _smooth_settled(
 
     def pass_back(means: list[jax.Array], varying: list[jax.Array]) -> tuple[list[jax.Array], list[jax.Array]]:
         """Return the smoothed means before a row from those after it, and the estimate's leaves that depend on data."""
-        row, row_number = (varying, jnp.zeros(0)), jnp.zeros((), int)  # no inputs; a backward step ignores its number
+        row = (varying, jnp.zeros(0))
+        row_number = jnp.zeros((), int)  # no inputs; a backward step ignores its number
         law, estimate = step_settled(back, smoothed.state, means, row, row_number)
         return means_of(law), smoothed.select_varying(estimate)
 

@@ -104,7 +104,9 @@ class Climbs(NamedTuple):
         climb = self.joined
         for _ in range(len(climb)):  # a climb may join one that joins a third
             climb = climb[climb]
-        x, total, gradient = self.x[climb], self.total[climb], self.gradient[climb]
+        x = self.x[climb]
+        total = self.total[climb]
+        gradient = self.gradient[climb]
         return ClimbEnds(x, total, gradient, self.converged[climb], self.remaining[climb], steps)
 
 
@@ -117,7 +119,8 @@ def join_climbs(state: Climbs, moving: np.ndarray, domains: OpenEnds) -> Climbs:
     gradients g, and (g_a - g_b)' d >= LEAST_BEND d' I d. `moving`: coordinates that move (climbs, p). `domains`: which
     are plain real numbers.
     """
-    climbs, g = np.arange(len(state.x)), np.nan_to_num(state.gradient)
+    climbs = np.arange(len(state.x))
+    g = np.nan_to_num(state.gradient)
     d = state.x[None, :] - state.x[:, None]  # [a, b]: from climb a to climb b, (a, b, p)
     # d' I d: the greater of the two values by the information of a and of b; `squared` [c, a, b] uses I of climb c.
     squared = np.einsum("abi,cij,abj->cab", d, np.nan_to_num(state.information), d)

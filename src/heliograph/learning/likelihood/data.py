@@ -191,7 +191,8 @@ def _join_nodes(network: Network, run: list[np.ndarray], inputs: Any) -> tuple[n
         length = len(measured[network.names[0]]) if measured else None  # that of the first node
         rows = check_rows(f"measurements of {name!r}", z, length, network.nodes[name].received, missing=True)
         measured[name] = np.asarray(rows)
-    steps, count = len(measured[network.names[0]]), len(network.inputs)
+    steps = len(measured[network.names[0]])
+    count = len(network.inputs)
     if inputs is None and count:
         raise fail("inputs", f"an array ({steps}, {count}) of {list(network.inputs)}", "none")
     u = np.zeros((steps, 0))

@@ -232,7 +232,8 @@ def _find_linear_filter(objective: Objective) -> Any:
     The linear form filters by means and covariances of gains. Its network is the description's start, or one near it
     if a gain that is random near the start is not at the start itself.
     """
-    description, is_linear = objective.description, objective.form == "linear"
+    description = objective.description
+    is_linear = objective.form == "linear"
     network = choose_typical_network(description) if is_linear else description.start
     filter = make_filter_of_form(network, objective.form)
     return filter if filter.has_score_recursion else None

@@ -91,7 +91,8 @@ class MaximumSearch:
         no_ends = np.zeros(starts.shape[1])  # no coordinate is held at an end of its domain
         climbed = self._climb_by_first_rows(starts, no_ends, own=0)
         top = self._prove_maximum(climbed)
-        self.best, totals = top._replace(converged=False, reason=""), climbed.total  # totals: l at each climb's end
+        self.best = top._replace(converged=False, reason="")
+        totals = climbed.total  # totals: l at each climb's end
         if len(starts) > 1:
             around = self._draw_starts_around(top, len(starts) - 1, seed)
             # The top itself is the last start, so that climbs to it join it; it is no new result, hence [:-1].
@@ -99,7 +100,8 @@ class MaximumSearch:
             totals = np.concatenate([totals, climbed.total[:-1]])
             if climbed.total.max() > top.total + SAME_LIKELIHOOD:
                 top = self._prove_maximum(climbed)
-        self.best, self.ends = top, -np.sort(-np.nan_to_num(totals, nan=-np.inf))  # the highest first
+        self.best = top
+        self.ends = -np.sort(-np.nan_to_num(totals, nan=-np.inf))  # the highest first
         return top
 
     def _prove_maximum(self, climbed: ClimbEnds) -> HighestPoint:
@@ -168,7 +170,8 @@ class MaximumSearch:
         if short is None:
             return self._climb(starts, ends)
         # Climb from all starts but `own` by the first rows. Coordinates at an end of their domain do not move.
-        others, x = np.arange(len(starts)) != own, starts.copy()
+        others = np.arange(len(starts)) != own
+        x = starts.copy()
         moving = np.repeat((ends == 0)[None], len(starts) - 1, axis=0)
         short_ends = maximise_from_starts(
             short.evaluate, starts[others], moving, domains=self.surface.domains, joining=True
@@ -209,7 +212,10 @@ class MaximumSearch:
 
         A number is put there if the likelihood is the same there as where the climb ended.
         """
-        domains, x, total, ends = self.surface.domains, top.x.copy(), top.total, top.ends.copy()
+        domains = self.surface.domains
+        x = top.x.copy()
+        total = top.total
+        ends = top.ends.copy()
         information = np.diag(self.surface.evaluations(x[None]).information[0])
         for index in np.flatnonzero(top.active & domains.single & (information < HARDLY_SEEN)):
             side = 1.0 if domains.high[index] and x[index] > 0 else -1.0
@@ -275,7 +281,8 @@ def _take_best_climb(climbed: ClimbEnds, ends: np.ndarray) -> HighestPoint:
     climbs from the highest down. `climbed.remaining`: nats that a further step would still gain.
     """
     best = int(climbed.order[0])
-    converged, remaining = bool(climbed.converged[best]), float(climbed.remaining[best])
+    converged = bool(climbed.converged[best])
+    remaining = float(climbed.remaining[best])
     return HighestPoint(
         x=climbed.x[best].copy(),
         ends=ends,

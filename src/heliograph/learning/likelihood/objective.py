@@ -115,7 +115,8 @@ class Objective:
             The NaN makes the likelihood NaN. An innovation of NaN would count as a row where nothing arrived.
             """
             is_lost = jnp.any(jnp.isnan(jnp.asarray(filter.estimate(state).mean)))
-            value, covariance = jnp.asarray(innovation.value), jnp.asarray(innovation.covariance)
+            value = jnp.asarray(innovation.value)
+            covariance = jnp.asarray(innovation.covariance)
             return jnp.where(is_lost, 0.0, value), jnp.where(is_lost, jnp.nan, covariance)
 
         innovations: tuple[jax.Array, jax.Array] = filter.scan(z, u, judged)
@@ -127,7 +128,8 @@ class Objective:
         Errors are NaN where the truth is not known. z: measurements (steps, received). u: inputs (steps, inputs).
         `truth`: true states (steps, n).
         """
-        filter, angles = self.filter(x), first(self.description.start.plant).angles
+        filter = self.filter(x)
+        angles = first(self.description.start.plant).angles
 
         def read_estimate(state: PyTree, innovation: Innovation, k: jax.Array) -> tuple[jax.Array, jax.Array]:
             """Return mean and claimed covariance of the estimate after a row."""

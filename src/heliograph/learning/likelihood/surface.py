@@ -124,7 +124,8 @@ class LikelihoodSurface:
         shifts = np.zeros((len(moving), len(x)))
         shifts[np.arange(len(moving)), moving] = width[moving]
         gradient = self.evaluations(np.concatenate([x + shifts, x - shifts])).gradient
-        forward, backward = gradient[: len(moving)], gradient[len(moving) :]
+        forward = gradient[: len(moving)]
+        backward = gradient[len(moving) :]
         # Row i, column j: -(dl/dx_j at x + w_i - dl/dx_j at x - w_i) / (2 w_i).
         block = (-(forward - backward) / (2 * width[moving][:, None]))[:, moving]
         # Made symmetric, as rounding leaves it almost.
@@ -180,7 +181,8 @@ class LikelihoodSurface:
         saddle, from which the search goes on along the direction. Only coordinates with `active` (p,) true count, along
         directions that the data identify, and lengths are in standard errors.
         """
-        evaluation, coordinates = self.evaluations(x[None]), np.flatnonzero(active)
+        evaluation = self.evaluations(x[None])
+        coordinates = np.flatnonzero(active)
         information = evaluation.information[0][np.ix_(coordinates, coordinates)]
         gradient = evaluation.gradient[0][coordinates]
         # `unit`: standard error of each coordinate alone, 1 / sqrt(I_ii) of the information I. In these units,
@@ -236,7 +238,8 @@ class LikelihoodSurface:
         points = np.repeat(x[None], len(first), axis=0)  # where climbs of the other coordinates begin
         side, distance = np.sign(first), np.abs(first)
         target = np.sqrt(2 * drop)  # the fall f at an end
-        inside, outside = np.zeros(len(first)), np.full(len(first), np.inf)  # distances that bracket each end
+        inside = np.zeros(len(first))
+        outside = np.full(len(first), np.inf)  # distances that bracket each end
         for _ in range(MOST_CUTS):
             # The profile at these distances: l with the other coordinates at their best.
             points[:, coordinate] = x[coordinate] + side * distance
@@ -244,7 +247,8 @@ class LikelihoodSurface:
             fall = _measure_fall(top, climbed.total)
             # Narrow the bracket: `inside` has not fallen to the target, `outside` has fallen further.
             is_beyond = fall > target
-            inside, outside = np.where(is_beyond, inside, distance), np.where(is_beyond, distance, outside)
+            inside = np.where(is_beyond, inside, distance)
+            outside = np.where(is_beyond, distance, outside)
             points = np.where(is_beyond[:, None], points, climbed.x)
             # Done where the fall is the target, the bracket is closed, or the profile has not fallen at `furthest`.
             is_there = np.abs(fall - target) < ACCURACY_OF_FALL * target

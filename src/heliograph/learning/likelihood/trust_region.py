@@ -258,7 +258,8 @@ def _update_hessian(
         accepted: whether the climb moves to the end of the step (climbs,).
         free: coordinates that are plain real numbers, no logarithms or logits (p,).
     """
-    last_model, last_information = np.nan_to_num(state.model), np.nan_to_num(state.information)
+    last_model = np.nan_to_num(state.model)
+    last_information = np.nan_to_num(state.information)
     # The gain that each of the two models would have predicted, g' p - p' B p / 2.
     slope = np.sum(state.gradient * step, axis=1)
     by_model = slope - np.sum(step * multiply_each(last_model, step), axis=1) / 2

@@ -71,7 +71,8 @@ def trust_region_step(
     step = _find_step_within(radius, g, b, d)
     length = np.linalg.norm(d * step, axis=1)
     factor = np.minimum(1.0, radius / np.where(length > 0, length, 1.0))
-    step, length = step * factor[:, None], length * factor
+    step = step * factor[:, None]
+    length = length * factor
     # What the model gains there: g' p - p' B p / 2.
     predicted = np.sum(step * (g - multiply_each(b, step) / 2), axis=1)
     return TrustRegionStep(step=step * unit, length=length, predicted=predicted)

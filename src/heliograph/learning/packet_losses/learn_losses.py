@@ -83,7 +83,8 @@ class LossMemory(NamedTuple):
         for stretch in check_fates(fates):
             # Of a stretch between arrivals the packets between them, which are exchangeable if losses are independent.
             for lost in _split_at_unknown(np.where(find_trials(stretch), stretch, np.nan)):
-                n, losses = len(lost), float(lost.sum())
+                n = len(lost)
+                losses = float(lost.sum())
                 pairs = 2 * losses * (n - losses)  # 2 n1 n0
                 runs = 1 + np.sum(np.diff(lost) != 0)
                 excess += runs - (1 + pairs / n)
@@ -181,7 +182,8 @@ def _find_significant_laws(laws: dict[str, AbstractLossLaw], parts: Fates) -> se
     significant = set[str]()
     for name, law in laws.items():
         # Independent losses have one number, so a law's further numbers are its degrees of freedom.
-        ratio, freedom = 2 * (total[name] - total[INDEPENDENT]), len(law.shares()) - 1
+        ratio = 2 * (total[name] - total[INDEPENDENT])
+        freedom = len(law.shares()) - 1
         if name != INDEPENDENT and scipy.stats.chi2.sf(ratio, freedom) < level:
             significant.add(name)
     return significant
@@ -288,7 +290,8 @@ class RunningRateLosses(AbstractLossLaw):
         # Packets of unknown fate are left out. Ends at which a stretch was cut because they arrived are no trials, and
         # become 0 (arrived), so that the law of the packets after them knows it.
         known = [stretch[~np.isnan(stretch)] for stretch in check_fates(fates)]
-        trials, stretches = [find_trials(stretch) for stretch in known], [fill_ends(stretch) for stretch in known]
+        trials = [find_trials(stretch) for stretch in known]
+        stretches = [fill_ends(stretch) for stretch in known]
 
         def likelihood(x: np.ndarray) -> tuple[float, np.ndarray]:
             """Return the log-likelihood at the logits x (3,) of base, weight and step, and its gradient (3,)."""

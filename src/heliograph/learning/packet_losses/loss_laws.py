@@ -327,8 +327,10 @@ class _LikelihoodBetweenEnds(NamedTuple):
         a, b = shares = 1 / (1 + np.exp(-x))
         # P_m = numerator / total. The derivative of power = (1 - a - b)^m by a, and by b, is `slope`.
         eigenvalue = 1 - a - b
-        power, slope = eigenvalue**self.spans, -self.spans * eigenvalue ** (self.spans - 1.0)
-        numerator, total = b + a * power, a + b
+        power = eigenvalue**self.spans
+        slope = -self.spans * eigenvalue ** (self.spans - 1.0)
+        numerator = b + a * power
+        total = a + b
         by_a = (power + a * slope) / numerator - 1 / total  # d log P_m / da
         by_b = (1 + a * slope) / numerator - 1 / total  # d log P_m / db
         (stayed, failed), (recovered, lost) = self.counts

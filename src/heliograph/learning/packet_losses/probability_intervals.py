@@ -79,7 +79,8 @@ def _find_profile_interval(function: LogLikelihood, top: np.ndarray, value: floa
         i: index of the share.
     """
     # A logit near the bounds of the search means a share of 0 or 1, as far as the data tell.
-    is_zero, is_one = top[i] < 4 - FURTHEST_LOGIT, top[i] > FURTHEST_LOGIT - 4
+    is_zero = top[i] < 4 - FURTHEST_LOGIT
+    is_one = top[i] > FURTHEST_LOGIT - 4
     level = value - (FALL_AT_END if is_zero or is_one else FALL)
     low = 0.0 if is_zero else _find_profile_crossing(function, top, level, i, side=-1)
     high = 1.0 if is_one else _find_profile_crossing(function, top, level, i, side=1)

@@ -77,7 +77,8 @@ def design_numbers(task: DesignProblem, build: Build) -> PowerDesign:
     # target what was minimised is the power, else the error.
     has_total = bool(np.isfinite(allowed.total))
     found, conditions = problem.solve_at(best), evaluate_lagrange_conditions(descent, limits, best, has_total)
-    network, error = problem.network(best), problem.criterion.compute_exact_error(found.covariances)
+    network = problem.network(best)
+    error = problem.criterion.compute_exact_error(found.covariances)
     value, unit = (error, "error") if target is None else (conditions.value, "power")
     certificate = Certificate(
         convex=False, value=value, bound=float("-inf"), stationarity=conditions.residual, starts=starts, unit=unit
@@ -107,7 +108,8 @@ def _limit_all_powers(problem: FreeNumberProblem, budget: object) -> PowerLimits
     if budget is None:
         return make_unlimited(steps, hops)
     # All hops may change their powers, and none sends a fixed one.
-    all_are_free, no_fixed_powers = np.ones(hops, dtype=bool), np.zeros((steps, hops))
+    all_are_free = np.ones(hops, dtype=bool)
+    no_fixed_powers = np.zeros((steps, hops))
     limits = make_power_limits(make_budget(budget), problem.names, all_are_free, no_fixed_powers)
     if min(np.min(limits.peak, initial=np.inf), np.min(limits.mean, initial=np.inf), limits.total) <= 0:
         raise fail("budget", "limits above zero where numbers are free", "zero")
@@ -188,9 +190,11 @@ def evaluate_lagrange_conditions(
     # Normals of the limits that are reached: of powers (the target last) and of the ends of the numbers' ranges.
     reached = programme.limit_room(z) < ACTIVE_ROOM
     axes = np.eye(len(z))
-    at_low, at_high = x <= problem.low + ACTIVE_ROOM * problem.unit, x >= problem.high - ACTIVE_ROOM * problem.unit
+    at_low = x <= problem.low + ACTIVE_ROOM * problem.unit
+    at_high = x >= problem.high - ACTIVE_ROOM * problem.unit
     normals = [*programme.limit_room_slope(z)[reached], *axes[at_low], *-axes[at_high]]
-    multipliers, residual = np.zeros(len(reached)), float(np.linalg.norm(gradient))
+    multipliers = np.zeros(len(reached))
+    residual = float(np.linalg.norm(gradient))
     if normals:
         solution, residual = nnls(np.array(normals).T, gradient)  # least squares with m >= 0
         multipliers[reached] = solution[: int(reached.sum())]

@@ -118,7 +118,8 @@ def _solve_periodic(system: ModeSystem) -> tuple[Parts, np.ndarray]:
             break
     # Policy iteration.
     for _ in range(MOST_POLICIES):
-        previous, parts = parts, _close_loop(system, gains).steady()  # X under these gains
+        previous = parts
+        parts = _close_loop(system, gains).steady()  # X under these gains
         if np.abs(parts - previous).max() <= CONVERGED * np.abs(parts).max():
             break
         # The gains of step k follow from X after the step before it (the period's last for k = 0).
@@ -174,7 +175,8 @@ def _close_loop(system: ModeSystem, gains: Numbers) -> JumpSystem:
         system: the system of the filter at each step, by mode.
         gains: K (steps, modes, n, m).
     """
-    K, law = gains, system.law[:, :, None, None]  # K (steps, modes, n, m); law: pi (steps, modes, 1, 1)
+    K = gains
+    law = system.law[:, :, None, None]  # K (steps, modes, n, m); law: pi (steps, modes, 1, 1)
     I_KH = np.eye(K.shape[2]) - K @ system.output  # I - K H
     # `[:, None]`: A and Q of a step are the same in all modes.
     noise_in_error = I_KH @ system.process[:, None] @ I_KH.swapaxes(-1, -2) + K @ system.noise @ K.swapaxes(-1, -2)

@@ -29,7 +29,8 @@ def find_least_error_powers(task: PowerTask) -> tuple[Powers, Certificate]:
     powers = problem.solve_from_starts(starts)
     assert powers is not None  # the starts are within the limits
     # The least value of the error's tangent at these powers within the limits. A convex error is nowhere below it.
-    value, bound = problem.compute_exact_error(powers), problem.lower_bound(powers)
+    value = problem.compute_exact_error(powers)
+    bound = problem.lower_bound(powers)
     tangent_value = problem.make_support(powers).value
     stationarity = max(tangent_value - bound, 0.0) / value if value > 0 else 0.0  # 0: nothing is left to gain
     # An error that is not convex is bounded by the convex problem with concave envelopes of each path's information.
@@ -69,7 +70,8 @@ def find_least_total_powers(task: PowerTask, target: float) -> tuple[Powers, Cer
     stationarity = 1 - bound / total if total > 0 else 0.0
     # An error that is not convex is bounded by the convex problem with concave envelopes of each path's information.
     if not task.convex:
-        relaxed, of_paths = unlimited.relax_to_whole_paths(), task.sum_by_path(powers)
+        relaxed = unlimited.relax_to_whole_paths()
+        of_paths = task.sum_by_path(powers)
         relaxed_powers = _find_least_powers(relaxed, [of_paths], target)
         bound = relaxed.bound_least_total(of_paths if relaxed_powers is None else relaxed_powers, target)
     fixed = float(task.fixed[:, ~task.free].mean(axis=0).sum())
@@ -137,10 +139,12 @@ def _check_reachable(task: PowerTask, target: float) -> None:
         task: the error, the free hops and the limits of their powers.
         target: the target error.
     """
-    limits, alpha = task.problem.limits, task.problem.paths.alpha[:, task.free]
+    limits = task.problem.limits
+    alpha = task.problem.paths.alpha[:, task.free]
     has_limits = np.any(np.isfinite(limits.peak)) or np.any(np.isfinite(limits.mean))
     # Each may send up to its peak, up to its mean power of all steps in one, and at most a lot of power (PLENTY).
-    plenty, whole_mean = PLENTY * np.maximum(alpha, 1.0), limits.mean * len(limits.peak)
+    plenty = PLENTY * np.maximum(alpha, 1.0)
+    whole_mean = limits.mean * len(limits.peak)
     largest_powers = np.minimum(np.minimum(limits.peak, plenty), whole_mean)
     least_error = task.problem.compute_exact_error(largest_powers)
     if target <= least_error * (1 + REACH_MARGIN):

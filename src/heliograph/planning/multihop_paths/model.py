@@ -101,7 +101,9 @@ def compute_covariances(plants: PlantSteps, information: Matrices) -> Matrices:
     else:
         predicted = a[0] @ plants.start @ a[0].T + q[0]
     # The recursion through the steps, on roots.
-    root, process, posteriors = roots_of(predicted), roots_of(q), list[np.ndarray]()
+    root = roots_of(predicted)
+    process = roots_of(q)
+    posteriors = list[np.ndarray]()
     for k, received in enumerate(information):
         if k:  # the first step is predicted already
             root = np.concatenate([a[k] @ root, process[k]], axis=1)
@@ -121,7 +123,8 @@ def compute_adjoint(plants: PlantSteps, information: Matrices, p: Matrices, weig
     """
     # From step to step the filter's error is multiplied by phi, and its covariance moves by X+ = phi X phi'.
     phi = (np.eye(p.shape[-1]) - p @ information) @ plants.transition
-    one_mode_always, no_noise = np.ones((len(p), 1, 1)), np.zeros_like(phi[:, None])
+    one_mode_always = np.ones((len(p), 1, 1))
+    no_noise = np.zeros_like(phi[:, None])
     system = JumpSystem(one_mode_always, phi[:, None], no_noise)
     return system.adjoint(weights, plants.start is None)[:, 0]
 
@@ -206,11 +209,13 @@ def independent_paths(
     steps = error.steps
     a = array("transition of paths", transition, ("states", "states"))
     n = len(a)
-    a, q = array("transition of paths", a, (n, n)), covariance("process noise of paths", process, n)
+    a = array("transition of paths", a, (n, n))
+    q = covariance("process noise of paths", process, n)
     c = array("rows of paths", rows, (None, n))
     r = require_at_least(0.0, "noises of paths", array("noises of paths", noises, (len(c),)))
     # kappa and alpha of all hops (sensors, hops of each); one of alpha without a second axis.
-    sensors, hops_each = len(c), 1 if rank("alpha of paths", alpha) < 2 else np.shape(alpha)[1]
+    sensors = len(c)
+    hops_each = 1 if rank("alpha of paths", alpha) < 2 else np.shape(alpha)[1]
     hop_kappa = _read_hop_numbers("kappa of paths", kappa, (sensors, hops_each), least=1.0)
     hop_alpha = _read_hop_numbers("alpha of paths", alpha, (sensors, hops_each), least=0.0)
     mean = array("initial mean of paths", np.zeros(n) if initial_mean is None else initial_mean, (n,))
@@ -309,7 +314,8 @@ def compute_path_information(paths: Paths, powers: Powers) -> PathInformation:
     """
     shares = share_of_signal(powers, paths.alpha)
     factors, positions = _arrange_by_position(paths, shares)  # factors (time, path, position)
-    F, sK = factors.prod(axis=-1), paths.second * compute_path_kappas(paths)
+    F = factors.prod(axis=-1)
+    sK = paths.second * compute_path_kappas(paths)
     denominator = sK - paths.signal * F
     # dF/dp_h is the product of the other hops' factors times alpha / (p + alpha)^2.
     products_of_others = [np.delete(factors, k, axis=-1).prod(axis=-1) for k in range(factors.shape[-1])]

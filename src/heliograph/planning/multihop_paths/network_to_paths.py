@@ -60,7 +60,8 @@ def paths_of(network: Network, error: Error) -> tuple[Paths, Float[np.ndarray, "
     """
     # Check that the plant is linear and every node a plain one, of a linear sensor behind hops.
     instance("network", network, Network, "a Network")
-    plant, steps = network.plant, instance("error", error, Error, "an Error").steps
+    plant = network.plant
+    steps = instance("error", error, Error, "an Error").steps
     start_plant = require_design_plant(plant)
     nodes = _require_plain_nodes(network)
     # Second moments E (x, 1)(x, 1)' of the plant at each step, or in its steady state.
@@ -71,7 +72,8 @@ def paths_of(network: Network, error: Error) -> tuple[Paths, Float[np.ndarray, "
         seconds, start = [steady_moment_with_one(plant)] * steps, None
     else:
         check_horizon(steps, covered)
-        seconds, start = moments_with_one_over(plant, steps), np.asarray(start_plant.initial_covariance)
+        seconds = moments_with_one_over(plant, steps)
+        start = np.asarray(start_plant.initial_covariance)
     # Paths of each step, and the plant's A and Q.
     described = [_make_paths_of_step(nodes, k, np.asarray(second)) for k, second in enumerate(seconds)]
     plant_at = [at(plant, k) for k in range(steps)]
@@ -179,7 +181,8 @@ def _compute_hop_kappa_and_alpha(hop: GainAndNoise) -> tuple[float, float]:
     """Return kappa = E g^2 / (E g)^2 and alpha = Var m / E g^2 of a hop that delivers g sent + m."""
     if len(hop.law.extremes()) > 1:
         raise _make_no_paths_error("a gain with uncertain probabilities")
-    mean, square = float(hop.law.moment(1)), float(hop.law.moment(2))
+    mean = float(hop.law.moment(1))
+    square = float(hop.law.moment(2))
     if mean == 0:
         raise fail("hop", "a gain whose mean is not zero (a linear filter receives no signal else)", "mean 0")
     if np.any(np.asarray(hop.noise.mean)):
@@ -255,7 +258,8 @@ def _make_paths_of_step(nodes: Mapping[str, Node], k: int, state: Float[np.ndarr
             raise fail(f"sensor of {name!r}", "a LinearSensor", type(sensor).__name__)
         refuse_angles("design", sensor)
         # Chains of the channel, and what their transmitters send at present, by E (y, 1)(y, 1)' of the outputs.
-        measured, noise = np.asarray(measured_moment_with_one(sensor, state)), np.asarray(sensor.noise.covariance)
+        measured = np.asarray(measured_moment_with_one(sensor, state))
+        noise = np.asarray(sensor.noise.covariance)
         chains = find_hop_chains(channel, np.eye(len(sensor.outputs), len(measured)))
         sent_powers = compute_sent_powers(channel, measured, k)
         _check_uncorrelated(name, np.array([chain.row[:-1] for chain in chains]), noise)

@@ -127,7 +127,8 @@ class PathProblem(NamedTuple):
         A convex error is nowhere below its tangent, so it needs at least this power.
         """
         _, value, gradient = self.make_support(powers)
-        low, high = 0.0, float(powers.mean(axis=0).sum()) * (1 + 1e-9)
+        low = 0.0
+        high = float(powers.mean(axis=0).sum()) * (1 + 1e-9)
         for _ in range(100):
             middle = (low + high) / 2
             best = self.limits._replace(total=middle).find_best_powers(-gradient)
@@ -188,7 +189,8 @@ class PowerTask(NamedTuple):
         """
         problem, limits = self.problem, self.problem.limits
         steps, count = problem.paths.second.shape  # (time, paths)
-        peak, mean = np.zeros((steps, count)), np.zeros(count)  # limits of a path: the sums of its hops' limits
+        peak = np.zeros((steps, count))
+        mean = np.zeros(count)  # limits of a path: the sums of its hops' limits
         np.add.at(peak.T, problem.path, limits.peak.T)
         np.add.at(mean, problem.path, limits.mean)
         cap = np.minimum(np.minimum(peak, mean * steps), limits.total * steps)

@@ -101,7 +101,8 @@ def split_power(alpha: "Float[ArrayLike, ' H']", total: "Float[ArrayLike, '']") 
     Raises:
         ValueError: a negative noise or total, no hops, or numbers whose squares overflow or underflow.
     """
-    noise, power = check_hop_noises(alpha), float(scalar("total power", total, 0.0))
+    noise = check_hop_noises(alpha)
+    power = float(scalar("total power", total, 0.0))
     if not np.any(noise):
         return np.zeros(len(noise))
     if power and not 1 / LARGEST <= power <= LARGEST:
@@ -134,7 +135,8 @@ def split_power_over_hops(whole: SplitPaths, total: PathValues) -> PowerSplit:
             alpha (time, path, hop), 0 where a path has fewer hops than another.
         total: the power P of each path at each step (time, path).
     """
-    alpha, power = whole.alpha, np.where(total > 0, total, 1.0)[..., None]  # any power where there is none: see below
+    alpha = whole.alpha
+    power = np.where(total > 0, total, 1.0)[..., None]  # any power where there is none: see below
     hops = (alpha > 0).sum(axis=-1)  # number of a path's free hops with noise
     # The powers p_h(l), (time, path, hop), of exactly this sum.
     log_l = _find_multiplier(alpha, power)
@@ -242,7 +244,8 @@ def compute_envelope(whole: SplitPaths, cap: PathValues) -> Envelope:
         noise = np.divide(alpha, p, out=np.zeros_like(p), where=p > 0)
         left_side = whole.full * np.prod(1 + noise, axis=-1) * (1 - p.sum(axis=-1) * np.exp(middle))
         is_above = left_side >= whole.signal
-        low, high = np.where(is_above, middle, low), np.where(is_above, high, middle)
+        low = np.where(is_above, middle, low)
+        high = np.where(is_above, high, middle)
     # The power where the ray touches, at most the cap, and its slope j(P) / P.
     p, _ = _split_at_multiplier(alpha, low[..., None])
     touch = np.minimum(np.where(hops > 1, p.sum(axis=-1), 0.0), cap)

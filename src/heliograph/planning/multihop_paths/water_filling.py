@@ -50,7 +50,8 @@ def water_filling(
     b = whole.full * alpha
     # `best` are the powers with the least gap so far. A gap of CLOSED_GAP (1e-14) of the error is only rounding.
     best = p = start
-    least_gap, idle = np.inf, 0  # iterations in a row without a smaller gap
+    least_gap = np.inf
+    idle = 0  # iterations in a row without a smaller gap
     slopes = slopes_at(p)
     for _ in range(MOST_ITERATIONS):
         # The gap of Frank and Wolfe: how far the error's tangent at p falls within the limits. No powers gain more.
@@ -102,7 +103,8 @@ def _fill_to_limits(limits: PowerLimits, weights: Powers, a: Powers, b: Powers) 
     of the power. Here p = [y rise - ground]^+ with rise = sqrt(w b) / a and ground = b / a. j is the information of a
     path, and w (`weights`) is -d error / d j.
     """
-    rise, ground = np.sqrt(np.maximum(weights, 0.0) * b) / a, b / a
+    rise = np.sqrt(np.maximum(weights, 0.0) * b) / a
+    ground = b / a
     steps, transmitters = ground.shape
     # Find the level at which each transmitter reaches its mean, and then the level of the total.
     no_limit = np.full(steps, np.inf)
@@ -151,7 +153,10 @@ def _find_level(
         total: the sum that is wanted.
     """
     grows = rise > 0
-    rise, ground, peak, highest = rise[grows], ground[grows], peak[grows], highest[grows]
+    rise = rise[grows]
+    ground = ground[grows]
+    peak = peak[grows]
+    highest = highest[grows]
     if not rise.size or not np.isfinite(total):
         return np.inf
     # The sum is piecewise linear in the level: it bends where a power begins to grow, or stops.
