@@ -329,7 +329,10 @@ def _roll_segments(
     begins = [0, *ends[:-1]]
 
     def join(*arrays: np.ndarray) -> np.ndarray:
-        """Return the rows of each segment from the array of its own filter, one segment after the other."""
+        """Return the rows of each segment from the array of its own filter, one segment after the other.
+
+        Segment i has the rows `begins[i]` to `ends[i]` - 1.
+        """
         rows_of_segments = zip(arrays, begins, ends, strict=True)
         return np.concatenate([np.asarray(array)[begin:end] for array, begin, end in rows_of_segments])
 

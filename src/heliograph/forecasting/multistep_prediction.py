@@ -189,7 +189,11 @@ class MultistepPredictor(Module):
         """
 
         def predict_outputs(mean: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array]:
-            """Return mean and covariance of the outputs from those of the states, for one Gaussian."""
+            """Return mean and covariance of the outputs from those of the states, for one Gaussian.
+
+            The other arguments of `find_signal_moments`, such as `plant`, `sensor` and `learned_noise`, are those of
+            `_measure_each_component`.
+            """
             states_law = from_covariance(mean, covariance)
             signal = find_signal_moments(plant, sensor, self.transform, states_law, initial_power, learned_noise)
             return signal.mean, signal.covariance

@@ -72,7 +72,8 @@ def _forecast_from_each_row(
     def filter_and_forecast(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, PyTree]:
         """Return the filter's state after row k, and the moments that it forecasts from there.
 
-        The row holds k, the measurements, the inputs, and `window`, the inputs of the `length` rows ahead.
+        The row holds k, the measurements, the inputs, and `window`, the inputs of the `length` rows ahead. `predictor`
+        steps the filter without data; `select` takes the horizons from the moments of all rows ahead.
         """
         k, z_k, u_k, window = row
         after, _ = filter.correct(filter.predict(state, u_k, k), z_k, k)

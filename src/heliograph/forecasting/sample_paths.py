@@ -262,7 +262,9 @@ def _draw_paths_from_states(
         """Draw row k of a path: return where the path is then, which the next row begins with, and state and output.
 
         `row` holds the inputs and the number k. The state moves by the plant, then noise is added; limits of states
-        hold after both.
+        hold after both. From outside: `plant` and `sensor` are the models of all rows, `switching` says how their modes
+        move, `step` is the number of the first row, `limits` are those of the states, and `learned` are deviations of
+        the noise that a filter learned.
         """
         (x, mode), (u_k, k) = before, row
         key_of_row = jax.random.fold_in(key, k)
@@ -281,7 +283,10 @@ def _draw_paths_from_states(
         return PathState(x, mode), (x, y)
 
     def draw_path(start: PathState, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return the states (rows, n) and outputs (rows, m) of one path, drawn row by row from its start."""
+        """Return the states (rows, n) and outputs (rows, m) of one path, drawn row by row from its start.
+
+        From outside: `u` are the inputs of the rows, `step` is the number of the first row, and `draw_row` draws a row.
+        """
         rows = jnp.asarray(u), jnp.asarray(step) + jnp.arange(len(u))
         path: tuple[jax.Array, jax.Array]
         _, path = jax.lax.scan(lambda before, row: draw_row(before, row, key), start, rows)

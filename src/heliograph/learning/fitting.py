@@ -219,7 +219,10 @@ def _make_climb_reporter(surface: LikelihoodSurface, say: Progress) -> Callable[
     form = surface.objective.form
 
     def report(climbs: ClimbEnds) -> None:
-        """Say which step the climbs are at, how many have converged, and the highest log-likelihood so far."""
+        """Say which step the climbs are at, how many have converged, and the highest log-likelihood so far.
+
+        `form` is the form of the likelihood, and `say` takes the line of text.
+        """
         best = np.nanmax(climbs.total)
         done = int(climbs.converged.sum())
         say(f"{form}: step {climbs.steps}, {done} of {len(climbs.x)} starts done, {best:.6g}")

@@ -37,6 +37,7 @@ from heliograph.random_affine.moments.second_moments import second_order
 if TYPE_CHECKING:
     from heliograph.learning.estimate_table import Solution
 
+KINDS_OF_MOMENTS = ("mean gain", "gain variance", "noise")
 POINTS_NEAR_START = 3
 LARGEST_DISTANCE = 0.5  # how far from the start, in each coordinate
 
@@ -275,10 +276,7 @@ def _join_names(names: list[str]) -> str:
 
 
 def _draw_measurements(objective: Objective, x: np.ndarray, u: np.ndarray, seed: int) -> Float[np.ndarray, "steps m"]:
-    """Return measurements (steps, received) drawn by the model of the filter at x (p,), with inputs u.
-
-    Each row is Gaussian given the earlier rows.
-    """
+    """Return measurements (steps, received) drawn by the model of the filter at x (p,) under inputs u, row by row."""
     with jax.enable_x64(True):
         return np.asarray(_draw_measurements_by_innovations(objective, x, u, jax.random.key(seed)))
 
@@ -296,7 +294,11 @@ def _draw_measurements_by_innovations(objective: Objective, x: Array, u: Array, 
     reporting = find_told_filter(filter)
 
     def draw_row(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, jax.Array]:
-        """Return the filter's state after row k, and the measurement drawn for it."""
+        """Return the filter's state after row k, and the measurement drawn for it.
+
+        `reporting` is the filter that reads numbers reported with messages, None if there are none; `key_of_numbers` is
+        the key that they are drawn with.
+        """
         k, u_k, noise = row
         prior = filter.predict(state, u_k, k)
         zeros = jnp.zeros(filter.received)
@@ -325,12 +327,6 @@ def _draw_measurements_by_innovations(objective: Objective, x: Array, u: Array, 
     return measurements
 
 
-if TYPE_CHECKING:
-    from heliograph.learning.estimate_table import Solution
-
-KINDS_OF_MOMENTS = ("mean gain", "gain variance", "noise")
-
-
 def describe_identified_links(solution: "Solution") -> list[str]:
     """Return a sentence on each output of which the data identify mean gain, gain variance or noise.
 
@@ -349,7 +345,10 @@ def describe_identified_links(solution: "Solution") -> list[str]:
         return []
 
     def compute_moments_at(x: Array) -> jax.Array:
-        """Return mean gain, gain variance and noise of each output (outputs, 3) at unconstrained coordinates x."""
+        """Return mean gain, gain variance and noise of each output (outputs, 3) at unconstrained coordinates x.
+
+        `description` builds the network from the free numbers.
+        """
         _, sensor, channel = join_all_nodes(description.at(description.parameters.values(x)))
         return _compute_link_moments(first(sensor), first(channel))
 

@@ -146,7 +146,8 @@ def fit_sender(
         """Return the log-likelihood of all recordings at unconstrained coordinates x (p,).
 
         `data`: recordings side by side; the first `lengths` rows of each count. IMPOSSIBLE_LIKELIHOOD: a very low
-        number that replaces -inf and NaN, since the search needs numbers.
+        number that replaces -inf and NaN, since the search needs numbers. `description` builds the network from the
+        free numbers.
         """
         filter = make_event_filter(description.at_point(x))
         recordings = zip(data.measurements, data.inputs, data.lengths, strict=True)

@@ -276,7 +276,10 @@ def _change_nodes(
     """
 
     def rename(limit: PerTransmitter) -> PerTransmitter:
-        """Return a limit with the names that transmitters have in the changed network; a number for all as it is."""
+        """Return a limit with the names that transmitters have in the changed network; a number for all as it is.
+
+        `renamed` has the new names of each transmitter that has others; it may be doubled, or left out.
+        """
         if not isinstance(limit, dict):
             return limit
         return {new: number for name, number in limit.items() for new in renamed.get(name, (name,))}

@@ -115,7 +115,10 @@ def compute_rate_on_grid(system: ScalarSystem, delta: float, share: float) -> Ra
     silence = ndtr((x + delta - upper[:, None]) / np.sqrt(r)) - ndtr((x - delta - upper[:, None]) / np.sqrt(r))
 
     def move_law(half: np.ndarray) -> np.ndarray:
-        """Return the rows of x >= 0 after x moves, from those before."""
+        """Return the rows of x >= 0 after x moves, from those before.
+
+        `T` has the probabilities [new, old] of cells of x after a step.
+        """
         below = half[:0:-1, ::-1]  # of x < 0: the same with both signs turned
         return np.asarray(T @ np.concatenate([below, half]))
 
@@ -123,7 +126,8 @@ def compute_rate_on_grid(system: ScalarSystem, delta: float, share: float) -> Ra
         """Return the law's rows of x >= 0 after a step, from those before it, as a vector.
 
         First x moves (`move_law`), then it is sent or not. Without a message (probability `silence`) the value sent
-        last stays. With one it is the measured value x + v, whose probabilities given x are `noise`.
+        last stays. With one it is the measured value x + v, whose probabilities given x are `noise`. `cells.of_delta`
+        is the number of cells within delta.
         """
         f = move_law(vector.reshape(-1, size))
         return np.asarray(f * silence + _compute_law_after_message(f, noise, cells.of_delta)).ravel()

@@ -372,7 +372,8 @@ def _draw_output_squares(
         """Return the state after step k, and (y, 1)(y, 1)' of every sensor, which measures it then.
 
         `x`: the state before. `row`: number of the step, and the inputs. From outside: `key_of_steps`, the trajectory's
-        key, from which each step gets keys of its own, and `sensors` by name.
+        key, from which each step gets keys of its own, and `sensors` by name. `plant` is the plant, which may vary over
+        time.
         """
         k, u = row
         key_of_noise, *keys_of_sensors = jax.random.split(jax.random.fold_in(key_of_steps, k), 1 + len(sensors))

@@ -327,7 +327,8 @@ class ScaledProgramme:
         def lagrangian_gradient(point: Vector) -> Vector:
             """Return the gradient of value - m' room by the variables `index`, in units of `scale`.
 
-            m are the `multipliers` of the `active` limits.
+            m are the `multipliers` of the `active` limits. It is that of the objective less m times the slopes of the
+            active limits' room.
             """
             gradient = self.objective(point).slope
             slopes = self.limit_room_slope(point)[active]

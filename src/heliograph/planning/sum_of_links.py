@@ -152,7 +152,10 @@ def _cap_amplitudes(b: Vector, noise: Vector, floor: float, caps: Vector) -> Vec
         return np.asarray(np.where(b > 0, np.minimum(theta * ratio, caps), 0.0))
 
     def excess(theta: float) -> float:
-        """Return theta b' a - (a' D a + N), which rises with theta."""
+        """Return theta b' a - (a' D a + N), which rises with theta.
+
+        a are the best amplitudes for this theta, `noise` is the diagonal of D, and `floor` is N.
+        """
         a = amplitudes_at(theta)
         return theta * float(b @ a) - float(noise @ a**2) - floor
 

@@ -68,7 +68,10 @@ def transmitter_names(channel: AbstractRandomAffine) -> list[str]:
     names: dict[str, None] = {}
 
     def note_name(name: str, hop: AbstractHop, signal: SignalMoment | None) -> AbstractHop:
-        """Note the hop's name, and leave the hop as it is."""
+        """Note the hop's name, and leave the hop as it is.
+
+        Names are keys of the dict `names`, in the order in which they come.
+        """
         names.setdefault(name)
         return hop
 

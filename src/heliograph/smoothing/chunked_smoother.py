@@ -96,7 +96,10 @@ def smooth_chunk(
         return select_state(k < end, step.back(law), law), None
 
     def pass_back_and_estimate(law: Gaussian, item: tuple[SmootherStep, Array]) -> tuple[Gaussian, Estimate]:
-        """Return the smoothed law before a row from the smoothed `law` after it, and the row's smoothed estimate."""
+        """Return the smoothed law before a row from the smoothed `law` after it, and the row's smoothed estimate.
+
+        `pass_back` takes the law one row back.
+        """
         step, _k = item
         law_before, _ = pass_back(law, item)
         return law_before, step.estimate_from(law)
@@ -145,7 +148,8 @@ def _smooth_all(recursion: SmootherStepRecursion, chunk_starts: ChunkStarts, row
         """Filter the chunks `which` from their first states, then smooth them; None without native code.
 
         The backward pass begins at the end of each chunk's window, which is before the row `window_ends`. If `later` is
-        given, the smoothed law after each chunk's own rows, it begins there.
+        given, the smoothed law after each chunk's own rows, it begins there. The numbers of first rows and the rows of
+        each chunk are in `chunk_starts` and `windows`; `recursion` is the filter over rows.
         """
         first = chunk_starts.first[which]
         is_given = np.full(len(first), later is not None)

@@ -180,8 +180,8 @@ def smooth_fixed_point(steps: SmootherStep, step: int) -> Estimate:
     def body(fixed_state: EarlierState, later_step: SmootherStep) -> tuple[EarlierState, Estimate]:
         """Update x_j by the data of a later step, and estimate it given all data up to there.
 
-        `fixed_state` is the regression of x_j on the present state: each later step first carries the regression to
-        the new present state.
+        `fixed_state` is the regression of x_j on the present state: each later step first carries the regression to the
+        new present state. `fixed_step` is the smoother step number j.
         """
         updated = later_step.ahead(fixed_state)  # x_j regressed on the state after the later step
         law = later_step.find_law_of_earlier(updated)

@@ -176,7 +176,11 @@ def _smooth_settled(
     last_means, steps_after = scan_settled_rows(recursion, settled, means_at_end, rows_after, first + own, end)
 
     def pass_back(means: list[jax.Array], varying: list[jax.Array]) -> tuple[list[jax.Array], list[jax.Array]]:
-        """Return the smoothed means before a row from those after it, and the estimate's leaves that depend on data."""
+        """Return the smoothed means before a row from those after it, and the estimate's leaves that depend on data.
+
+        `back` is the backward pass with steady covariances, and `varying` the leaves of the row's smoother step that
+        depend on data.
+        """
         row = (varying, jnp.zeros(0))
         row_number = jnp.zeros((), int)  # no inputs; a backward step ignores its number
         law, estimate = step_settled(back, smoothed.state, means, row, row_number)

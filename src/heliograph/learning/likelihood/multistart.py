@@ -196,7 +196,10 @@ class MaximumSearch:
         """
 
         def keep_best(now: ClimbEnds) -> None:
-            """Keep the best point so far in `self.best`, as not converged, and call `self.watch` with the climbs."""
+            """Keep the best point so far in `self.best`, as not converged, and call `self.watch` with the climbs.
+
+            `ends` are the coordinates that are held at an end of their domain.
+            """
             top = _take_best_climb(now, ends)
             if self.best is None or not top.total < self.best.total:  # `not <` also if the earlier total is NaN
                 self.best = top._replace(converged=False, reason="")

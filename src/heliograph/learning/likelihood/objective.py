@@ -132,7 +132,10 @@ class Objective:
         angles = first(self.description.start.plant).angles
 
         def read_estimate(state: PyTree, innovation: Innovation, k: jax.Array) -> tuple[jax.Array, jax.Array]:
-            """Return mean and claimed covariance of the estimate after a row."""
+            """Return mean and claimed covariance of the estimate after a row.
+
+            `filter` is the filter with the free numbers at x.
+            """
             estimate = filter.estimate(state)
             return jnp.asarray(estimate.mean), jnp.asarray(estimate.covariance)
 

@@ -59,7 +59,8 @@ class HiddenModeLosses(AbstractLossLaw):
         def likelihood(x: np.ndarray) -> tuple[float, np.ndarray]:
             """Return log P(fates) - log P(ends arrive) at the logits x, and its gradient.
 
-            The second term is for stretches that were chosen to end with an arrival; `ends` is None if there are none.
+            `whole` has all stretches. The second term is for stretches that were chosen to end with an arrival: `ends`
+            has these ends alone, and is None if there are none.
             """
             value, gradient = whole.likelihood(x)
             if ends is None:

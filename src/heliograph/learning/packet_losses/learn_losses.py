@@ -294,7 +294,10 @@ class RunningRateLosses(AbstractLossLaw):
         stretches = [fill_ends(stretch) for stretch in known]
 
         def likelihood(x: np.ndarray) -> tuple[float, np.ndarray]:
-            """Return the log-likelihood at the logits x (3,) of base, weight and step, and its gradient (3,)."""
+            """Return the log-likelihood at the logits x (3,) of base, weight and step, and its gradient (3,).
+
+            `stretches` are the known fates, and `trials` says which of them count.
+            """
             # The derivative of a share p by its logit is p (1 - p).
             share = expit(x)
             total, gradient = 0.0, np.zeros(len(x))

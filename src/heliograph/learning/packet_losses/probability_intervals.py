@@ -112,7 +112,7 @@ def _find_profile_crossing(function: LogLikelihood, top: np.ndarray, level: floa
         """Return how far the profile is above `level` when logit number i is held at `logit`.
 
         The profile is the log-likelihood `function`, maximised over the other logits. The search begins at
-        `start_of_others`, which is the last result above the level.
+        `start_of_others`, which is the last result above the level. `others` are the indices of the other logits.
         """
         nonlocal start_of_others
         function_of_others = _fix_logit(function, i, logit, others)
@@ -137,7 +137,10 @@ def _fix_logit(function: LogLikelihood, i: int, fixed: float, others: np.ndarray
     """Return the log-likelihood as a function of the logits with indices `others`, with logit i held at `fixed`."""
 
     def function_of_others(free: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return the log-likelihood with logit i held and the others at `free`, and its gradient by the others."""
+        """Return the log-likelihood with logit i held and the others at `free`, and its gradient by the others.
+
+        `function` is the log-likelihood of all logits, and `fixed` the value of logit i.
+        """
         x = np.zeros(len(free) + 1)
         x[i], x[others] = fixed, free
         value, gradient = function(x)

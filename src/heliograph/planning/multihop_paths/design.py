@@ -119,7 +119,10 @@ def _raise_powers(problem: PathProblem, start: Powers, target: float) -> Powers 
     """
 
     def reaches(factor: float) -> bool:
-        """Return whether the start's powers times this factor, cut to the limits, lead to the target error or less."""
+        """Return whether the start's powers times this factor, cut to the limits, lead to the target error or less.
+
+        `problem` has the error as a function of the powers, and their limits.
+        """
         powers = problem.limits.clip_powers(start * factor)
         return problem.criterion.smooth(problem.covariances(powers)).value <= target
 
