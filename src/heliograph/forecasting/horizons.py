@@ -175,7 +175,10 @@ def _require_step_count(value: object) -> int:
 
 
 def _list_horizons(horizons: object) -> list[object]:
-    """Return horizons as a list; a single time or date gives a list of one."""
+    """Return horizons as a list; a single time or date gives a list of one.
+
+    A list of anything is checked later, horizon by horizon.
+    """
     if isinstance(horizons, float | timedelta | datetime | np.timedelta64 | np.datetime64):
         return [horizons]
     values = list(cast(Iterable[object], horizons)) if rank("horizons", horizons) == 1 else []
@@ -223,7 +226,10 @@ def _read_date_ahead(origin: Origin, horizon: datetime | np.datetime64) -> tuple
 
 
 def _convert_span_to_seconds(span: timedelta | np.timedelta64) -> float:
-    """Return a span of time in seconds; raise ValueError if it is missing, has no unit, or is of months or years."""
+    """Return a span of time in seconds; raise ValueError if it is missing, has no unit, or is of months or years.
+
+    A month has no length in seconds; a span that NumPy writes without a unit has none either.
+    """
     if isinstance(span, timedelta):
         return span.total_seconds()
     unit, size = np.datetime_data(span)

@@ -168,7 +168,16 @@ class ModeSwitching(NamedTuple):
         return jnp.where(stays, mode, jax.random.categorical(key, jnp.log(transition[mode])))
 
     def choose_models(self, plant: Any, sensor: Any, mode: jax.Array) -> tuple[Any, Any]:
-        """Return plant and sensor of one step as they are in a joint mode; a part without modes as it is."""
+        """Return plant and sensor of one step as they are in a joint mode; a part without modes as it is.
+
+        A joint mode is a mode of the plant, one of the sensor and one of the channel together; the filter has a table
+        of each part's mode by joint mode.
+
+        Args:
+            plant: the plant of the step.
+            sensor: the sensor of the step, or None.
+            mode: number of the joint mode.
+        """
         plant_mode = jnp.asarray(self.filter.plant_modes)[mode]
         sensor_mode = jnp.asarray(self.filter.sensor_modes)[mode]
         if isinstance(plant, ModalPlant):
@@ -179,7 +188,11 @@ class ModeSwitching(NamedTuple):
 
 
 def _find_switching(target: ForecastTarget) -> ModeSwitching | None:
-    """Return how the modes of plant and sensor move, or None if these have no modes."""
+    """Return how the modes of plant and sensor move, or None if these have no modes.
+
+    Paths draw the present mode from the filter's probabilities of the modes, so only a filter that has them will do.
+    `target` is the filter, with its plant, sensor and last state.
+    """
     filter = target.predictor.filter
     plant = target.predictor.plant
     sensor = target.predictor.sensor

@@ -123,7 +123,11 @@ def crps(law: MixtureLaws, values: np.ndarray) -> np.ndarray:
 
 
 def _compute_distance_of_two(law: MixtureLaws) -> np.ndarray:
-    """Return E|X - X'| of independent X and X' of each row's law (rows,); each pair of parts counts twice."""
+    """Return E|X - X'| of independent X and X' of each row's law (rows,); each pair of parts counts twice.
+
+    It is sum_ij w_i w_j E|Y_ij|, with Y_ij Gaussian of mean m_i - m_j and variance v_i + v_j, for parts i and j of the
+    mixture.
+    """
     total = np.zeros(len(law.weights))
     for i in range(law.weights.shape[1]):
         differences = law.means[:, [i]] - law.means[:, i:]

@@ -188,7 +188,10 @@ class Solution:
         return ("cosines", LEVEL) in self._tables
 
     def describe_with_cheap_errors(self) -> list[str]:
-        """Return a line for each number: its estimate, and an interval by the expected information at the maximum."""
+        """Return a line for each number: its estimate, and an interval by the expected information at the maximum.
+
+        A printed fit shows it where `rows` were not asked for: it needs no derivatives by row.
+        """
         active, values = self.active, self.parameters.entries_at(self.x)
         # A number's variance is g' I^-1 g, with its derivative g, unconstrained too, by the active coordinates.
         information = self.surface.evaluations(self.top.x[None]).information[0][np.ix_(active, active)]

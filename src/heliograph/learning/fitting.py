@@ -200,7 +200,14 @@ def _choose_starts(surface: LikelihoodSurface, count: int, seed: int) -> Float[n
 
 
 def _require_information_on_each_number(surface: LikelihoodSurface, points: np.ndarray) -> None:
-    """Raise ValueError for a free number of which the data have no information, or no derivative, at all points."""
+    """Raise ValueError for a free number of which the data have no information, or no derivative, at all points.
+
+    Such a number could be anything, and a search would not end.
+
+    Args:
+        surface: the likelihood over the free numbers.
+        points: the starts of the search (starts, p).
+    """
     information = np.diagonal(surface.evaluations(points).information, axis1=1, axis2=2)
     for name, own in zip(surface.objective.description.parameters.coordinates, information.T, strict=True):
         if np.all(np.isnan(own)):

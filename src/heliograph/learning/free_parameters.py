@@ -161,7 +161,10 @@ class Parameters:
         )
 
     def values(self, x: Array) -> dict[str, Array]:
-        """Return the free numbers {name: number} at unconstrained coordinates x (p,), in operations that JAX traces."""
+        """Return the free numbers {name: number} at unconstrained coordinates x (p,), in operations that JAX traces.
+
+        The coordinates of all numbers stand one after another in x.
+        """
         ends = np.cumsum([0, *(parameter.size for parameter in self.every)])
         return {
             parameter.name: map_from_unconstrained(parameter.domain, parameter.start.shape, x[begin:end])

@@ -155,7 +155,10 @@ class FreeNumberCollector:
         return mark_checked(start, self.marks[-1].report)
 
     def parameters(self) -> Parameters:
-        """Return all marked free numbers as parameters; a number without a name is named after its place."""
+        """Return all marked free numbers as parameters; a number without a name is named after its place.
+
+        A number without a domain, whose place requires nothing, may be any real number.
+        """
         taken = {mark.given for mark in self.marks if mark.given is not None}
         results = []
         for mark in self.marks:

@@ -304,7 +304,10 @@ def _bound_by_relaxation(senders: _PlantAndSenders, total: int) -> float:
 
 
 def _find_envelope(values: Float[np.ndarray, " bits"]) -> list[tuple[int, float]]:
-    """Return the corners (B, j) of the concave envelope of j(B) = values[B], from B = 0 on, as long as it rises."""
+    """Return the corners (B, j) of the concave envelope of j(B) = values[B], from B = 0 on, as long as it rises.
+
+    The envelope is the least concave function above j: lines between these corners.
+    """
     corners = [(0, float(values[0]))]
     while corners[-1][0] < len(values) - 1:
         # The next corner is the point to which the line from here rises most steeply.

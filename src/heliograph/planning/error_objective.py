@@ -49,7 +49,10 @@ class Error(Module):
         at_end: bool = False,
         period: int = 1,
     ):
-        """Check and hold which number is made of the covariance P, and of which steps."""
+        """Check and hold which number is made of the covariance P, and of which steps.
+
+        The arguments are those of the class.
+        """
         if isinstance(weight, Mapping):
             self.weight = dict(weight)
         else:

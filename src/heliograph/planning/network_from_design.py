@@ -79,7 +79,11 @@ def designed_network(network: Network, powers: Mapping[str, Float[np.ndarray, "s
 
 
 def repeat_network(network: Network) -> Network:
-    """Return the network with everything that varies over time repeated, so that it lasts for a long run."""
+    """Return the network with everything that varies over time repeated, so that it lasts for a long run.
+
+    A design of a period covers only one period; what varies over time (`OverTime`) is repeated to COVERED (100) steps
+    or more.
+    """
 
     def repeat(leaf: object) -> object:
         """Return an OverTime repeated to COVERED steps or more; anything else as it is."""

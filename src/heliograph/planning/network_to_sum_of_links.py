@@ -78,7 +78,11 @@ def find_links_of_sum(node: Node, second: Float[np.ndarray, "m1 m1"]) -> tuple[S
 
 
 def _require_plain_sum(node: Node) -> tuple[LinearSensor, Superposed]:
-    """Return the sensor and the sum of links of a node; raise ValueError if the formulas of a design do not hold."""
+    """Return the sensor and the sum of links of a node; raise ValueError if the formulas of a design do not hold.
+
+    They hold for a linear sensor, and links of one hop each that carry one number, without memory, delays or uncertain
+    probabilities, to one sum.
+    """
     sensor, channel = node.sensor, node.channel
     if not isinstance(sensor, LinearSensor) or sensor.circular:
         raise _make_no_formula_error("a sensor that varies, is not linear or has angles")

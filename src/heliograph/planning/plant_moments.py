@@ -153,7 +153,14 @@ def measured_moment_with_one(sensor: AnySensor, second: Float[Array, "n1 n1"], s
 
 
 def _append_shift(matrix: Float[Array, "m n"], shift: Float[Array, "m"]) -> Float[Array, "m1 n1"]:
-    """Return the matrix (m + 1, n + 1) of the map from (x, 1) to (M x + shift, 1)."""
+    """Return the matrix (m + 1, n + 1) of the map from (x, 1) to (M x + shift, 1).
+
+    It is [[M, shift], [0, 1]].
+
+    Args:
+        matrix: M (m, n).
+        shift: (m,).
+    """
     n = matrix.shape[1]
     row_of_one = np.eye(1, n + 1, n)  # (0, ..., 0, 1), which keeps the 1
     xp = library(matrix, shift)

@@ -133,7 +133,10 @@ class ScaledProgramme:
         self.size = max(value, LEAST_SIZE) if np.isfinite(value) else 1.0
 
     def evaluate_at(self, z: Vector) -> Evaluation | None:
-        """Return the evaluation at a point z = x / unit, or None if there is none; the last evaluation is cached."""
+        """Return the evaluation at a point z = x / unit, or None if there is none; the last evaluation is cached.
+
+        SciPy asks for the objective, the limits and their slopes at the same point one after another.
+        """
         point, (last_point, evaluation) = z.tobytes(), self._last
         if point != last_point:
             evaluation = self.problem.evaluate(np.asarray(z * self.problem.unit), self.sharpness)

@@ -63,7 +63,10 @@ def visit_hops(channel: AbstractRandomAffine, visit: Visit, signal: SignalMoment
 
 
 def transmitter_names(channel: AbstractRandomAffine) -> list[str]:
-    """Return the names of the transmitters, in order of appearance."""
+    """Return the names of the transmitters, in order of appearance.
+
+    A transmitter in several modes or alternatives of the channel is listed once.
+    """
     # A dict has each name once, like a set, but keeps the order.
     names: dict[str, None] = {}
 

@@ -94,7 +94,11 @@ def data_free_smoother_steps(filter: AbstractFilter, inputs: Array) -> SmootherS
 
 
 def smooth_fixed_interval(steps: SmootherStep) -> Estimate:
-    """Estimate each step's state given all data, by one backward pass over smoother steps, stacked along time."""
+    """Estimate each step's state given all data, by one backward pass over smoother steps, stacked along time.
+
+    The pass begins with the filtered law after the last step, given which each step's law follows from that of the step
+    after it.
+    """
 
     def body(later: Gaussian, pair: tuple[SmootherStep, SmootherStep]) -> tuple[Gaussian, Estimate]:
         """Smooth the state between two steps from `later`, the smoothed law of the state after both.
@@ -112,7 +116,10 @@ def smooth_fixed_interval(steps: SmootherStep) -> Estimate:
 
 
 def smooth_fixed_interval_means(steps: SmootherStep) -> jax.Array:
-    """Return the mean (steps, n) of each step's state given all data, by one backward pass over smoother steps."""
+    """Return the mean (steps, n) of each step's state given all data, by one backward pass over smoother steps.
+
+    It is `smooth_fixed_interval` without covariances, where these are known from elsewhere.
+    """
 
     def body(later: jax.Array, pair: tuple[SmootherStep, SmootherStep]) -> tuple[jax.Array, jax.Array]:
         """Smooth the mean of the state between two steps from `later`, the smoothed mean of the state after both.

@@ -86,7 +86,10 @@ class Objective:
         return hash((_list_code_and_closure(self.description.build)[0], self.form))
 
     def _list_distinctions(self) -> tuple[object, ...]:
-        """Return a tuple of everything by which two objectives may differ, to compare them."""
+        """Return a tuple of everything by which two objectives may differ, to compare them.
+
+        The network at the start is among it, as the function may read numbers that live outside of it.
+        """
         description = self.description
         return (
             self.form,

@@ -46,7 +46,14 @@ def approximate_law_by_nodes(law: AbstractLaw, count: int) -> Discrete:
 
 
 def discretise_laws(channel: Map, count: int) -> Map:
-    """Return the channel with the law of each random gain replaced by `count` values; constant gains stay."""
+    """Return the channel with the law of each random gain replaced by `count` values; constant gains stay.
+
+    What arrives then is a mixture of finitely many Gaussians, whose density can be computed.
+
+    Args:
+        channel: the channel, a tree with laws of gains among its leaves.
+        count: number of values of each law.
+    """
 
     def is_law(leaf: object) -> bool:
         """Return whether a part of the channel is a law, which is replaced as a whole."""

@@ -82,7 +82,10 @@ class LikelihoodSurface:
         return LikelihoodSurface(self.objective, first_rows)
 
     def evaluations(self, x: Float[np.ndarray, "points p"]) -> Evaluation:
-        """Return l, scores and information at each point (points, p); the last result is kept for equal points."""
+        """Return l, scores and information at each point (points, p); the last result is kept for equal points.
+
+        A search asks at the same points for the value, the gradient and the information one after another.
+        """
         if self._last:
             last_points, last_evaluation = self._last[0]
             if np.array_equal(last_points, x):

@@ -138,7 +138,13 @@ class FateRuns:
 
     @staticmethod
     def of(fates: Fates) -> "FateRuns":
-        """Return the runs of equal fates in some stretches (packets,), each stretch after a START."""
+        """Return the runs of equal fates in some stretches (packets,), each stretch after a START.
+
+        A run is a row of successive packets with the same fate; of a long recording there are few.
+
+        Args:
+            fates: fates of each stretch (packets,): 0 arrived, 1 lost, NaN unknown.
+        """
         # Write fates as whole numbers: 0 arrived, 1 lost, or UNKNOWN.
         code = np.concatenate([[START, *np.where(np.isnan(f), UNKNOWN, f).tolist()] for f in fates]).astype(int)
         begins_run = np.concatenate([[True], (np.diff(code) != 0) | (code[1:] == START)])

@@ -314,7 +314,11 @@ class RunningRateLosses(AbstractLossLaw):
         return {name: getattr(self, name) for name in ("base", "weight", "step")}
 
     def predicted(self, fate: Packets) -> Packets:
-        """Return the probability of each loss by the running rate, which an unknown fate does not change."""
+        """Return the probability of each loss by the running rate, which an unknown fate does not change.
+
+        `fate` (packets,): 0 arrived, 1 lost, NaN unknown. The rate is followed over the known fates alone, and each
+        packet takes the one after the last known fate before it.
+        """
         known = ~np.isnan(fate)
         base, weight, step = (share.estimate for share in self.shares().values())
         # The probability of loss after 0, 1, ..., all known fates.

@@ -134,7 +134,16 @@ def _find_profile_crossing(function: LogLikelihood, top: np.ndarray, level: floa
 
 
 def _fix_logit(function: LogLikelihood, i: int, fixed: float, others: np.ndarray) -> LogLikelihood:
-    """Return the log-likelihood as a function of the logits with indices `others`, with logit i held at `fixed`."""
+    """Return the log-likelihood as a function of the logits with indices `others`, with logit i held at `fixed`.
+
+    A profile is the maximum of this function: the log-likelihood, largest over the other logits.
+
+    Args:
+        function: log-likelihood of all logits (p,), with its gradient.
+        i: index of the logit that is held.
+        fixed: its value.
+        others: indices of the other logits (p - 1,).
+    """
 
     def function_of_others(free: np.ndarray) -> tuple[float, np.ndarray]:
         """Return the log-likelihood with logit i held and the others at `free`, and its gradient by the others.

@@ -79,7 +79,10 @@ class FreeNumbers(NamedTuple):
         return np.concatenate([number.high.ravel() for number in self.by_name.values()])
 
     def split_by_name(self, x: Array) -> dict[str, Any]:
-        """Return {name: number in its shape} from the vector x of all free numbers, which stand one after another."""
+        """Return {name: number in its shape} from the vector x of all free numbers, which stand one after another.
+
+        JAX may trace x.
+        """
         by_name, begin = {}, 0
         for name, number in self.by_name.items():
             by_name[name] = x[begin : begin + number.start.size].reshape(number.start.shape)
@@ -123,7 +126,7 @@ def make_free_numbers(free: object) -> FreeNumbers:
 
 
 def _read_range_end(name: str, end: object, shape: tuple[int, ...]) -> np.ndarray:
-    """Return the lower or upper end of a number's range, broadcast to the start's shape; it may be infinite."""
+    """Return an end of the range of the number `name`, broadcast to its start's `shape`; it may be infinite."""
     try:
         value = np.broadcast_to(np.asarray(end, dtype=float), shape)
     except (TypeError, ValueError):
@@ -289,12 +292,7 @@ class FreeNumberProblem:
         """Build the network at the starts of its free numbers, and compile its programs.
 
         If a mean gain is uncertain, the scalar of Young's inequality, which bounds the error, becomes one more free
-        number, and `young` is True.
-
-        Args:
-            build: function that returns the network, with the free numbers as keyword arguments.
-            numbers: the free numbers, with their starts and ranges.
-            error: the error that is to be small.
+        number, and `young` is True. `build` takes the free numbers as keyword arguments.
         """
         self.build, self.numbers, self.error, self.young = build, numbers, error, False
         network = self.network(numbers.start)

@@ -55,7 +55,10 @@ class RiccatiMap(NamedTuple):
 
 
 def compose_steps(first: RiccatiMap, second: RiccatiMap) -> RiccatiMap:
-    """Return the map of two filter steps, `first` and then `second`, as one map X -> A X (I + G X)^-1 A' + H."""
+    """Return the map of two filter steps, `first` and then `second`, as one map X -> A X (I + G X)^-1 A' + H.
+
+    Maps of this form are closed under composition, so that one of many steps is found by doubling.
+    """
     inner = np.linalg.inv(np.eye(len(first.h)) + first.h @ second.g)
     through = inner @ first.a
     g = first.g + first.a.T @ second.g @ through

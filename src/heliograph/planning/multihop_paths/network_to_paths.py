@@ -95,7 +95,10 @@ def paths_of(network: Network, error: Error) -> tuple[Paths, Float[np.ndarray, "
 
 
 def _require_plain_nodes(network: Network) -> dict[str, Node]:
-    """Return the nodes by name; raise ValueError for relays that filter, a shared channel, or senders not plain."""
+    """Return the nodes by name; raise ValueError for relays that filter, a shared channel, or senders not plain.
+
+    A plain node has a sensor that sends what it measures at each step, over a channel of its own.
+    """
     if network.relays is not None:
         raise fail("network", "a RelayNetwork alone, whose relays' gains are free", "a Network of relays that filter")
     if network.common is not None:
@@ -178,7 +181,10 @@ def _make_chain(parts: list[AbstractRandomAffine], rows: Float[np.ndarray, "k m1
 
 
 def _compute_hop_kappa_and_alpha(hop: GainAndNoise) -> tuple[float, float]:
-    """Return kappa = E g^2 / (E g)^2 and alpha = Var m / E g^2 of a hop that delivers g sent + m."""
+    """Return kappa = E g^2 / (E g)^2 and alpha = Var m / E g^2 of a hop that delivers g sent + m.
+
+    These two numbers are all that the information of a path needs of a hop.
+    """
     if len(hop.law.extremes()) > 1:
         raise _make_no_paths_error("a gain with uncertain probabilities")
     mean = float(hop.law.moment(1))
