@@ -158,9 +158,25 @@ def fit_sender(
     random = np.random.default_rng(seed)
     points = [parameters.start, *(parameters.start + random.uniform(-1, 1, (starts - 1, len(parameters.start))))]
     top = _search_from_starts(likelihood, points, say)
-    # An interval for each number, as far as Ctrl-C lets the search come.
+    rows, stopped = _make_rows(description, likelihood, top, say)
+    return SenderFit(description, top.x, top.total, tuple(rows), top.converged, stopped)
+
+
+def _make_rows(
+    description: Description, likelihood: Likelihood, top: "_BestPoint", say: Callable[[str], None]
+) -> tuple[list[Row], bool]:
+    """Return a row with an interval for each number of the table, and whether the search was stopped.
+
+    After Ctrl-C, rows have no intervals.
+
+    Args:
+        description: the network with its free numbers.
+        likelihood: log-likelihood at a point in unconstrained coordinates.
+        top: the maximum.
+        say: called with a line of text at each interval.
+    """
     rows, stopped = list[Row](), top.stopped
-    for i, entry in enumerate(parameters.entries):
+    for i, entry in enumerate(description.parameters.entries):
         say(f"interval of {entry.name}")
         row = _make_row_without_interval(description, top.x, i)
         try:
@@ -168,7 +184,7 @@ def fit_sender(
         except KeyboardInterrupt:
             stopped = True
             rows.append(row)
-    return SenderFit(description, top.x, top.total, tuple(rows), top.converged, stopped)
+    return rows, stopped
 
 
 def _search_from_starts(

@@ -170,12 +170,39 @@ def _make_unmet_limits_error(problem: DescentProblem, limits: PowerAndErrorLimit
     return fail("budget", expected, "none that is")
 
 
+def _find_multipliers(programme: ScaledProgramme, problem: DescentProblem, x: Vector) -> tuple[Vector, float]:
+    """Return the multipliers m >= 0 of the limits (limits,), 0 where one is not reached, and |gradient - normals' m|.
+
+    The normals are those of the limits that are reached, of powers (the target error last) and of the ends of the
+    numbers' ranges. At a minimum they make up the whole gradient, and nothing is left of it.
+
+    Args:
+        programme: the objective and the limits, as functions of z = x / unit.
+        problem: the ranges and units of the numbers.
+        x: values of the free numbers.
+    """
+    z = x / problem.unit
+    gradient = programme.objective(z).slope
+    reached = programme.limit_room(z) < ACTIVE_ROOM
+    axes = np.eye(len(z))
+    at_low = x <= problem.low + ACTIVE_ROOM * problem.unit
+    at_high = x >= problem.high - ACTIVE_ROOM * problem.unit
+    normals = [*programme.limit_room_slope(z)[reached], *axes[at_low], *-axes[at_high]]
+    multipliers = np.zeros(len(reached))
+    if not normals:
+        return multipliers, float(np.linalg.norm(gradient))
+    solution, residual = nnls(np.array(normals).T, gradient)  # least squares with m >= 0
+    multipliers[reached] = solution[: int(reached.sum())]
+    return multipliers, residual
+
+
 def evaluate_lagrange_conditions(
     problem: DescentProblem, limits: PowerAndErrorLimits, x: Vector, has_total: bool
 ) -> LagrangeConditions:
     """Return Lagrange's conditions at the point x: how far the gradient is from a sum of the reached limits' normals.
 
-    The multipliers m >= 0 minimise |gradient - normals' m|; in a minimum nothing of the gradient is left.
+    The multipliers m >= 0 minimise |gradient - normals' m|; in a minimum nothing of the gradient is left. They say what
+    a watt more is worth.
 
     Args:
         problem: the function of the free numbers that is minimised, their ranges and units.
@@ -186,18 +213,8 @@ def evaluate_lagrange_conditions(
     # The programme counts numbers in their units, z = x / unit, and values in that at x, `programme.size`.
     programme = ScaledProgramme(problem, limits, problem.sharpnesses[-1], x)
     z = x / problem.unit
-    value, gradient = programme.objective(z)
-    # Normals of the limits that are reached: of powers (the target last) and of the ends of the numbers' ranges.
-    reached = programme.limit_room(z) < ACTIVE_ROOM
-    axes = np.eye(len(z))
-    at_low = x <= problem.low + ACTIVE_ROOM * problem.unit
-    at_high = x >= problem.high - ACTIVE_ROOM * problem.unit
-    normals = [*programme.limit_room_slope(z)[reached], *axes[at_low], *-axes[at_high]]
-    multipliers = np.zeros(len(reached))
-    residual = float(np.linalg.norm(gradient))
-    if normals:
-        solution, residual = nnls(np.array(normals).T, gradient)  # least squares with m >= 0
-        multipliers[reached] = solution[: int(reached.sum())]
+    value = programme.objective(z).value
+    multipliers, residual = _find_multipliers(programme, problem, x)
     # The worth of a watt of each transmitter at each step, from the multipliers of the limits of power; of the total's
     # alone that of a watt more of the total. A watt at every step, sent at one step, is worth `steps` times as much.
     worths = limits.rows * multipliers[: len(limits.most), None] * programme.size  # (limits, time and hops)

@@ -145,20 +145,11 @@ def _make_chain(parts: list[AbstractRandomAffine], rows: Float[np.ndarray, "k m1
     """
     if parts[-1].outputs != 1:
         raise _make_no_paths_error(f"one gain for {parts[-1].outputs} numbers")
+    maps, loss_factor = _take_losses_apart(parts)
     row = rows[0]
-    loss_factor = 1.0  # product of the losses' kappas
     has_offset = False  # whether a wire behind a hop has added a constant
     hops: dict[str, tuple[float, float]] = {}  # kappa and alpha by name
-    while parts:
-        affine = parts.pop(0)
-        # A loss that nobody observes is a random gain, 0 or 1, of kappa = 1 / P(arrival). The maps that it may lose
-        # take its place in the series.
-        if isinstance(affine, Mixture):
-            inner, factor = _split_loss(affine)
-            parts, loss_factor = [*inner.in_series, *parts], loss_factor * factor
-            continue
-        if not isinstance(affine, GainAndNoise):
-            raise _make_no_paths_error(type(affine).__name__)
+    for affine in maps:
         # The first map may combine several numbers; of a single one the hop's alpha holds the unit already.
         if not hops:
             row = np.asarray(affine.matrix)[0] @ rows if affine.inputs > 1 else rows[0]
@@ -178,6 +169,29 @@ def _make_chain(parts: list[AbstractRandomAffine], rows: Float[np.ndarray, "k m1
     elif loss_factor > 1:
         raise _make_no_paths_error("a wire that loses what it carries")
     return HopChain(row, hops)
+
+
+def _take_losses_apart(parts: list[AbstractRandomAffine]) -> tuple[list[GainAndNoise], float]:
+    """Return the maps of a series without its unobserved losses, and the product of the losses' kappas.
+
+    A loss that nobody observes is a random gain, 0 or 1, of kappa = E g^2 / (E g)^2 = 1 / P(arrival). The maps that it
+    may lose take its place in the series.
+
+    Raises:
+        ValueError: maps that are neither losses nor of one gain and noise.
+    """
+    left, maps, loss_factor = list(parts), list[GainAndNoise](), 1.0
+    while left:
+        affine = left.pop(0)
+        if isinstance(affine, Mixture):
+            inner, factor = _split_loss(affine)
+            left = [*inner.in_series, *left]
+            loss_factor = loss_factor * factor
+        elif isinstance(affine, GainAndNoise):
+            maps.append(affine)
+        else:
+            raise _make_no_paths_error(type(affine).__name__)
+    return maps, loss_factor
 
 
 def _compute_hop_kappa_and_alpha(hop: GainAndNoise) -> tuple[float, float]:
