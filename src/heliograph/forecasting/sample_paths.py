@@ -17,7 +17,7 @@ from heliograph.model.forecast_origin import HasOrigin
 from heliograph.model.markov_jump_models import ModalPlant, ModalSensor, transition_over
 from heliograph.model.over_time import at, first
 from heliograph.model.plant import AnyPlant
-from heliograph.model.sensor import AnySensor
+from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.numerics.angles.angle import wrap_angles
 from heliograph.numerics.angles.manifold import Manifold
 from heliograph.numerics.check import check_count, check_seed, fail, scalar
@@ -309,7 +309,7 @@ def _draw_paths_from_states(
     return paths
 
 
-def _draw_outputs(sensor: Any, x: jax.Array, key: jax.Array, learned: Array | None) -> jax.Array:
+def _draw_outputs(sensor: AbstractSensor, x: jax.Array, key: jax.Array, learned: Array | None) -> jax.Array:
     """Return what a sensor measures (m,) of a state x, with noise drawn from its law.
 
     Args:
@@ -320,6 +320,5 @@ def _draw_outputs(sensor: Any, x: jax.Array, key: jax.Array, learned: Array | No
     """
     law, noise = sensor.noise, sensor.noise.sample(key)
     if learned is not None:
-        noise = law.mean + jnp.asarray(learned) * (noise - law.mean)
-    y: jax.Array = wrap_angles(sensor.measure(x) + noise, sensor.angles)
-    return y
+        noise = jnp.asarray(law.mean + jnp.asarray(learned) * (noise - law.mean))
+    return jnp.asarray(wrap_angles(sensor.measure(x) + noise, sensor.angles))

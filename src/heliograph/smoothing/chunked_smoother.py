@@ -8,7 +8,7 @@ Smoother steps stay in the SIMD lane of their chunk.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +16,7 @@ import numpy as np
 
 from heliograph.engine.choice import choose_code
 from heliograph.factors.factored_gaussian import Gaussian
+from heliograph.filters.base import AbstractFilter
 from heliograph.filters.rows.chunks import (
     ChunkStarts,
     find_chunk_starts,
@@ -41,7 +42,7 @@ class SmoothedRows(NamedTuple):
     sums: Float[np.ndarray, "5"]
 
 
-def smooth_in_chunks(filter: Any, z: Array, u: Array) -> SmoothedRows | None:
+def smooth_in_chunks(filter: AbstractFilter, z: Array, u: Array) -> SmoothedRows | None:
     """Smooth a long recording in chunks of rows that are computed in parallel; None if it cannot be divided so.
 
     A chunk may begin with any state some rows before its own, if the filter forgets its start: any two states lead to
