@@ -131,7 +131,7 @@ def identify_by_recording(surface: LikelihoodSurface, start: Float[np.ndarray, "
     Args:
         surface: the likelihood of the recording.
         start: unconstrained coordinates of the free numbers (p,).
-        seed: of the points that are drawn.
+        seed: of the points.
     """
     points = _draw_points_near(start, seed)
     late = surface.evaluations(np.stack(points)).late
@@ -202,10 +202,13 @@ def describe_unidentified(identifiability: Identifiability, solution: "Solution 
 def _describe_confounded_group(parameters: Parameters, group: ConfoundedNumbers, solution: "Solution | None") -> str:
     """Return one sentence on a group of confounded numbers: which sums or products of them the data do tell.
 
-    Confounded numbers are free numbers that the data do not tell apart. An example: "Of a and b only the product a * b
-    (0.48, 95 % 0.44..0.53) is identified; fix one." The interval needs a `solution`, the maximum of the likelihood.
-    `group` has the numbers' indices, how many must be fixed (`fix`), and the combinations that are identified:
-    `exponents` of products, `weights` of sums (combinations, numbers).
+    Confounded numbers are those that the data do not tell apart. An example: "Of a and b only the product a * b (0.48,
+    95 % 0.44..0.53) is identified; fix one."
+
+    Args:
+        parameters: the free numbers, with their names.
+        group: the numbers' indices, how many must be fixed, and the products and sums that are identified.
+        solution: the maximum of the likelihood; None where there is none yet.
     """
     names = [parameters.coordinates[i] for i in group.coordinates]
     if group.fix == len(names):  # no combination of them is identified
@@ -335,8 +338,7 @@ def describe_identified_links(solution: "Solution") -> list[str]:
     sensor or channel varies over time, or depends on inputs or the past.
 
     Args:
-        solution: the maximum of the likelihood, with the point x, the covariance of its active coordinates (not at an
-            end of their domain), and the network as a function of x.
+        solution: the maximum of the likelihood, at the point x, with the covariance of its active coordinates.
     """
     # The sensor and channel of all nodes together, at the starting point, to see of what kind they are.
     description = solution.surface.objective.description

@@ -43,6 +43,7 @@ def steady_covariance(transition: Float[Array, "n n"], process: Float[Array, "n 
         ValueError: a plant that is not stable (where A is traced nobody can see it).
     """
     a = transition
+    # Traced by JAX: as the steady moments of a jump system of one step and one mode, whose axes lead.
     if is_traced(a, process):
         one_mode = JumpSystem(np.ones((1, 1, 1)), jnp.asarray(a)[None, None], jnp.asarray(process)[None, None])
         return jnp.asarray(one_mode.steady()[0, 0])

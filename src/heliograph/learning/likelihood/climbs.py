@@ -116,8 +116,12 @@ def join_climbs(state: Climbs, moving: np.ndarray, domains: OpenEnds) -> Climbs:
     Two climbs to one top cost twice as much. Both are within JOINING_DISTANCE standard errors of a top and of each
     other, by the information I of either, and less than NEIGHBOUR_DISTANCE apart in every logarithm and logit. Between
     them, along d = x_b - x_a, the log-likelihood l is concave: l_b - l_a is (g_a + g_b)' d / 2 as of a quadratic with
-    gradients g, and (g_a - g_b)' d >= LEAST_BEND d' I d. `moving`: coordinates that move (climbs, p). `domains`: which
-    are plain real numbers.
+    gradients g, and (g_a - g_b)' d >= LEAST_BEND d' I d.
+
+    Args:
+        state: the climbs, with points x, log-likelihoods l, gradients g and information I.
+        moving: coordinates that move (climbs, p).
+        domains: which coordinates are logarithms or logits, and which plain real numbers.
     """
     climbs = np.arange(len(state.x))
     g = np.nan_to_num(state.gradient)

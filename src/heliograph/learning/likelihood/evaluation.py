@@ -186,7 +186,7 @@ def evaluate_recording(objective: Objective, x: Array, z: Array, u: Array, truth
         k, e, s, de, ds, compared = row
         # A measurement may end in the modes of a channel, which are not predicted, so e may be shorter.
         compared = compared[: len(e)]
-        size = jnp.abs(compared) + jnp.abs(compared - e)
+        size = jnp.abs(compared) + jnp.abs(compared - e)  # of what e is the difference of, which bounds its rounding
         density, score, information = differentiate_log_density(e, s, (de, ds), size, ~jnp.isnan(e))
         is_in_half = jnp.stack([k < half, k >= half])
         return halves + jnp.where(is_in_half[:, None, None], information, 0.0), (density, score)

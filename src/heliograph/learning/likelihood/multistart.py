@@ -269,8 +269,12 @@ class MaximumSearch:
     def _evaluate_inwards_of_end(self, top: HighestPoint, index: int) -> tuple[np.ndarray, np.ndarray]:
         """Return points (points, p) from the end of a number's domain inwards, and how much higher l is at each.
 
-        `index`: coordinate of the number. `top`: the point at the end. DISTANCES_INWARDS: distances from the end, 0 to
-        40 steps of a logarithm or logit. The log-likelihood l counts as -inf where it is NaN.
+        Their distances from the end are DISTANCES_INWARDS, 0 to 40 steps of a logarithm or logit. The log-likelihood l
+        counts as -inf where it is NaN.
+
+        Args:
+            top: the point, at which the number is at an end of its domain.
+            index: coordinate of the number.
         """
         points = np.repeat(top.x[None], len(DISTANCES_INWARDS), axis=0)
         points[:, index] -= top.ends[index] * DISTANCES_INWARDS
@@ -280,8 +284,10 @@ class MaximumSearch:
 def _take_best_climb(climbed: ClimbEnds, ends: np.ndarray) -> HighestPoint:
     """Return the best of the climbs, with the reason why it stopped if it did not converge.
 
-    `ends` (p,): -1 or 1 if a coordinate was held at an end of its domain, else 0. `climbed.order`: numbers of the
-    climbs from the highest down. `climbed.remaining`: nats that a further step would still gain.
+    Args:
+        climbed: where the climbs ended: `order` has their numbers from the highest down, and `remaining` the nats that
+            a further step would still gain.
+        ends: -1 or 1 if a coordinate was held at an end of its domain, else 0 (p,).
     """
     best = int(climbed.order[0])
     converged = bool(climbed.converged[best])

@@ -105,7 +105,11 @@ def _start_climbs(evaluate: Evaluate, start: np.ndarray, moving: np.ndarray, dom
 def _is_finite(total: np.ndarray, gradient: np.ndarray, information: np.ndarray, moving: np.ndarray) -> np.ndarray:
     """Return for each climb whether log-likelihood, gradient and information are finite in moving coordinates.
 
-    Shapes: `total` (climbs,), `gradient` and `moving` (climbs, p), `information` (climbs, p, p).
+    Args:
+        total: log-likelihood (climbs,).
+        gradient: (climbs, p).
+        information: (climbs, p, p).
+        moving: coordinates that move (climbs, p); derivatives by others may be anything.
     """
     finite_gradient = np.all(np.isfinite(gradient) | ~moving, axis=1)
     finite_information = np.isfinite(information) | ~(moving[:, :, None] & moving[:, None, :])
@@ -116,9 +120,13 @@ def _mark_arrived(state: Climbs, moving: np.ndarray, domains: OpenEnds, close: f
     """Return the state with climbs marked as done that have arrived, or whose radius is below SMALLEST_RADIUS.
 
     A climb has arrived if g' I^-1 g, twice what a full step would still gain, is below `close`; it has then converged.
-    At so small a radius rounding hides the gain, and CONVERGED_GAIN_BY_ROUNDING takes the place of `close`. `state`:
-    gradient g and information I of each climb. `moving` (climbs, p): coordinates that move; those at an end of their
-    domain, by `domains`, count no more.
+    At so small a radius rounding hides the gain, and CONVERGED_GAIN_BY_ROUNDING takes the place of `close`.
+
+    Args:
+        state: the climbs, with gradient g and information I.
+        moving: coordinates that move (climbs, p); those at an end of their domain count no more.
+        domains: coordinates whose domains end at infinity.
+        close: bound of g' I^-1 g.
     """
     counting = moving & ~find_coordinates_at_limits(state.x, state.gradient, domains)
     remaining = np.where(state.done, state.remaining, expected_gain(state.gradient, state.information, counting) / 2)

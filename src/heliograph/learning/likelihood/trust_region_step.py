@@ -119,8 +119,13 @@ def _find_step_within(radius: np.ndarray, g: np.ndarray, b: np.ndarray, d: np.nd
 def _solve_shifted(b: np.ndarray, shift: np.ndarray, d: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Return (B + s D^2)^-1 r of each climb (climbs, p), or 0 along directions in which the matrix is singular.
 
-    `b`: B (climbs, p, p). `shift`: s (climbs,). `d`: the diagonal of D (climbs, p). `right`: r (climbs, p). A climb is
-    one of several searches side by side. An eigenvalue below ROUNDING times the largest counts as 0.
+    An eigenvalue below ROUNDING times the largest counts as 0.
+
+    Args:
+        b: B of each climb, one of several searches side by side (climbs, p, p).
+        shift: s (climbs,).
+        d: diagonal of D (climbs, p).
+        right: r (climbs, p).
     """
     matrix = b + (shift[:, None] * d * d)[:, :, None] * np.eye(b.shape[1])
     try:
@@ -136,6 +141,11 @@ def expected_gain(
 
     Only coordinates marked in `counting` (climbs, p) and identified directions count. A direction with an eigenvalue of
     at most FLAT_EIGENVALUE, in units of standard errors, is not identified.
+
+    Args:
+        gradient: g (climbs, p).
+        information: I (climbs, p, p).
+        counting: coordinates that count (climbs, p).
     """
     unit, _ = find_errors_and_flat_directions(information, counting)
     scaled = _scale_both_sides(information, unit)
@@ -153,6 +163,10 @@ def find_errors_and_flat_directions(information: np.ndarray, moving: np.ndarray)
     that are not `moving`. A flat direction is an eigenvector of I_ij / sqrt(I_ii I_jj) without information, eigenvalue
     <= FLAT_EIGENVALUE. It is a column of the result (climbs, p, p), in units of the errors; the columns of other
     eigenvectors are 0.
+
+    Args:
+        information: I of each climb (climbs, p, p).
+        moving: coordinates that move (climbs, p).
     """
     diagonal = np.diagonal(information, axis1=1, axis2=2)
     # Information below LEAST_INFORMATION counts as none, since its square would underflow.
