@@ -202,7 +202,7 @@ def _choose_starts(surface: LikelihoodSurface, count: int, seed: int) -> Float[n
 def _require_information_on_each_number(surface: LikelihoodSurface, points: np.ndarray) -> None:
     """Raise ValueError for a free number of which the data have no information, or no derivative, at all points.
 
-    Such a number could be anything, and a search would not end.
+    The estimate of such a number could be anything.
 
     Args:
         surface: the likelihood over the free numbers.

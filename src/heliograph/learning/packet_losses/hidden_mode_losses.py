@@ -140,7 +140,7 @@ class FateRuns:
     def of(fates: Fates) -> "FateRuns":
         """Return the runs of equal fates in some stretches (packets,), each stretch after a START.
 
-        A run is a row of successive packets with the same fate; of a long recording there are few.
+        A run is a row of successive packets with the same fate; the likelihood has one factor for each.
 
         Args:
             fates: fates of each stretch (packets,): 0 arrived, 1 lost, NaN unknown.

@@ -44,7 +44,7 @@ class ModeSystem(NamedTuple):
         law: pi, the probability of each mode at each step (time, M).
         output: H (time, M, m, n).
         noise: N (time, M, m, m).
-        powers: what the transmitters send (time, hops); the error does not depend on them otherwise.
+        powers: what the transmitters send, for the limits of a design (time, hops).
         start: error covariance before the first step (n, n); None where the steps repeat for ever.
     """
 
