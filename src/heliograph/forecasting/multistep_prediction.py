@@ -77,7 +77,7 @@ class MultistepPredictor(Module):
         """Return the moments of the plant's states as a mixture of K Gaussians: K = 1 unless the filter has a mixture.
 
         Covariances are zero if the filter claims none. If states have limits, the moments are those given that all
-        limits hold.
+        limits hold. `state`: the filter's state.
         """
         filter = self.filter
         if not isinstance(filter, LimitedFilter):
@@ -98,7 +98,8 @@ class MultistepPredictor(Module):
         """Return the moments of the states before they are conditioned on their limits, for a sampler that cuts draws.
 
         Only means beyond a limit are moved to it (`hold`), as in the filter's own correction. The weights of the K
-        Gaussians are those given that the limits hold: one that lies mostly beyond them is less probable.
+        Gaussians are those given that the limits hold: one that lies mostly beyond them is less probable. `state`: the
+        filter's state.
         """
         filter = self.filter
         if not isinstance(filter, LimitedFilter):

@@ -236,7 +236,7 @@ def _test_normality(e: np.ndarray) -> float:
     """Return the p-value of n (S^2 + (K - 3)^2 / 4) / 6, with S the skewness and K the kurtosis of residuals.
 
     The number is chi-squared with 2 degrees of freedom if the n residuals that are not NaN are normal. The result is
-    NaN for n below FEWEST_RESIDUALS.
+    NaN for n below FEWEST_RESIDUALS. `e`: residuals (steps,), NaN where nothing arrived.
     """
     e = e[~np.isnan(e)]
     n = len(e)
@@ -252,7 +252,8 @@ def _test_same_variance(e: np.ndarray) -> float:
     """Return the two-sided p-value of the ratio of the sums of squares in the last and the first third of residuals.
 
     With h residuals (not NaN) in a third, the ratio has the F law with h and h degrees of freedom if the variance is
-    the same. The result is NaN for h below half of FEWEST_RESIDUALS.
+    the same. The result is NaN for h below half of FEWEST_RESIDUALS. `e`: residuals (steps,), NaN where nothing
+    arrived.
     """
     e = e[~np.isnan(e)]
     h = len(e) // 3

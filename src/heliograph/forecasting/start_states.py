@@ -33,6 +33,8 @@ def find_origin(source: object) -> Origin:
 def find_common_origin(source: Sources) -> Origin:
     """Return where a forecast starts; a list of sources gives one origin with an axis over the sources.
 
+    `source`: a result or a live object, or a list of these.
+
     Raises:
         ValueError: what `find_origin` refuses, an empty list, sources of other models or other steps.
     """

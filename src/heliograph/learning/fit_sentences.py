@@ -43,7 +43,8 @@ def describe_boundaries(best: Solution) -> list[str]:
 def describe_form_conflict(solutions: tuple[Solution, ...]) -> list[str]:
     """Return a sentence for each number on which the two forms of the likelihood disagree beyond their errors.
 
-    They disagree if the estimates differ by more than FORMS_APART times the larger standard error.
+    They disagree if the estimates differ by more than FORMS_APART times the larger standard error. `solutions`: the
+    maximum of each form, linear and conditional; of one form alone there is nothing to compare.
     """
     if len(solutions) < 2:
         return []

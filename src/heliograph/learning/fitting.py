@@ -151,7 +151,8 @@ def _convert_event_tables(recording: Any) -> tuple[object, dict[str, Delays]]:
     """Return the recordings with tables of events turned into rows, and the law of delays of each node in them.
 
     An event table (`heliograph.files.EventTable`) has messages with the times when they were measured and logged, from
-    which delays are learned. Recordings of another kind stay as they are, and give no delays.
+    which delays are learned. Recordings of another kind stay as they are, and give no delays. `recording`: one
+    recording, or a list of several.
     """
     recordings = recording if isinstance(recording, list) else [recording]
     tables = [table for table in recordings if hasattr(table, "lateness")]  # only these know how late a message came

@@ -207,7 +207,7 @@ def _search_from_starts(
     def evaluate(x: Float[np.ndarray, " p"]) -> float:
         """Return the log-likelihood at a point, and keep the best point so far in `best`.
 
-        It is kept as not converged, to be returned if the search is stopped.
+        It is kept as not converged, to be returned if the search is stopped. `x`: the point (p,).
         """
         nonlocal best
         total = likelihood(x)

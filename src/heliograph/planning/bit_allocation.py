@@ -133,6 +133,8 @@ def design_bits(network: Network, total: int) -> BitsDesign:
 def _collect_plant_and_senders(network: Network) -> _PlantAndSenders:
     """Return plant, sensors and the information of their words of 0 to MOST_BITS bits, as arrays.
 
+    `network`: nodes whose senders send words.
+
     Raises:
         ValueError: a plant that is not linear and stable; a node without an encoder, or with several outputs.
     """

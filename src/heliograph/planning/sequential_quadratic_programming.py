@@ -358,7 +358,8 @@ def search_from_starts(problem: DescentProblem, limits: PowerAndErrorLimits, sta
     """
     points = [start / problem.unit for start in starts]
     sharpest = problem.sharpnesses[-1]
-    # Coarse descents from everywhere, the largest eigenvalue sharper and sharper.
+    # Coarse descents from everywhere, the largest eigenvalue sharper and sharper. From a single start the fine descent
+    # below is the only one with the sharpest.
     for sharpness in problem.sharpnesses if len(points) > 1 else problem.sharpnesses[:-1]:
         programmes = [ScaledProgramme(problem, limits, sharpness, z * problem.unit) for z in points]
         points = [programme.descend(z, COARSE_TOLERANCE) for programme, z in zip(programmes, points, strict=True)]

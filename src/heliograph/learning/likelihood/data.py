@@ -241,5 +241,5 @@ def _check_enough_data(data: LikelihoodData, free: int) -> None:
     arrived = [values for values in arrived if len(values)]
     is_constant = bool(arrived) and all(np.ptp(values) == 0 for values in arrived)
     if is_constant:
-        value = array("m", arrived[0], (None,))[0]
+        value = arrived[0][0]
         raise fail("recording", "measurements that vary", f"{value:g} throughout")

@@ -109,7 +109,7 @@ class MaximumSearch:
 
         A point is a maximum if two conditions hold. For numbers inside their domains, g' H^-1 g is negligible and H is
         not indefinite, with g the gradient of the log-likelihood l and H the Hessian of -l. For numbers that were put
-        at an end of their domain, l does not rise on the way back inside.
+        at an end of their domain, l does not rise on the way back inside. `climbed`: where the climbs ended.
         """
         no_ends = np.zeros(climbed.x.shape[1])
         top = _take_best_climb(climbed, no_ends)
@@ -213,7 +213,8 @@ class MaximumSearch:
     def _move_to_limits(self, top: HighestPoint) -> HighestPoint:
         """Return the point with those numbers at an end of their domain that the data hardly see, climbed anew.
 
-        A number is put there if the likelihood is the same there as where the climb ended.
+        A number is put there if the likelihood is the same there as where the climb ended. The data hardly see a number
+        whose logarithm or logit has an information below HARDLY_SEEN. `top`: the highest point so far.
         """
         domains = self.surface.domains
         x = top.x.copy()
@@ -257,7 +258,7 @@ class MaximumSearch:
 
         l then grows for ever as variances fall, but a climb ends where innovations are rounding. l per number of data
         is about -log |innovation|, so l + log |data| is about log(|data| / |innovation|): above EXACT_FIT it is
-        rounding.
+        rounding. `top`: the highest point.
         """
         data = self.surface.data.measurements if self.surface.data.truth is None else self.surface.data.truth
         log_likelihood_of_number = top.total / np.count_nonzero(~np.isnan(data))

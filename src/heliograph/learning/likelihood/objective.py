@@ -29,6 +29,8 @@ from heliograph.simulation.node import Node
 def join_all_nodes(network: Network) -> tuple[AnyPlant, AnySensor, Channel]:
     """Return the plant, and the sensor and channel of all nodes together in their order, if all packets arrive.
 
+    A fit takes what all nodes receive as one measurement, since their sensors see one state.
+
     Raises:
         ValueError: relays that filter and forward, sensors with feedback, senders of words (a sensor with a resolution
             can be learned).

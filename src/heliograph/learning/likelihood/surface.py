@@ -301,7 +301,7 @@ def _find_ends_at_infinity(parameter: Parameter) -> tuple[Bool[np.ndarray, " siz
     """Return which coordinates of a free number reach an end of its domain at minus infinity, and which at infinity.
 
     Logits (such as of probabilities) have both ends. Logarithms have the end at minus infinity; a covariance has them
-    on its diagonal.
+    on its diagonal. A real number without ends has none.
     """
     domain, none = parameter.domain, np.zeros(parameter.size, dtype=bool)
     if domain.kind == "simplex":

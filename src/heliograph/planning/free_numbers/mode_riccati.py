@@ -106,7 +106,8 @@ def _solve_periodic(system: ModeSystem) -> tuple[Parts, np.ndarray]:
     X_k,i = E[e e' 1{mode i}] is the covariance of the filter's error e after step k in mode i, times the mode's
     probability. The coupled Riccati recursion alone converges slowly. So it runs, period after period, until X changes
     by no more than NEARLY_STEADY of its size. Policy iteration goes on from there, which needs few rounds: it solves
-    the linear equation of X under fixed gains, and takes the best gains for that X.
+    the linear equation of X under fixed gains, and takes the best gains for that X. `system`: the system of the filter
+    at each step of the period, by mode.
     """
     # The recursion; X begins as pi Q, the plant's noise alone.
     last = system.law[-1, :, None, None] * system.process[-1]

@@ -69,7 +69,7 @@ def compose_steps(first: RiccatiMap, second: RiccatiMap) -> RiccatiMap:
 def solve_fixed_point(step: RiccatiMap) -> Float[np.ndarray, "n n"]:
     """Return the limit X of X+ = A X (I + G X)^-1 A' + H from X = 0, by doubling: k doublings make 2^k steps.
 
-    It is reached when a doubling changes H by at most the share CONVERGED.
+    It is reached when a doubling changes H by at most the share CONVERGED. `step`: A, G and H.
 
     Raises:
         ValueError: covariances that grow without limit.

@@ -175,7 +175,7 @@ def _take_losses_apart(parts: list[AbstractRandomAffine]) -> tuple[list[GainAndN
     """Return the maps of a series without its unobserved losses, and the product of the losses' kappas.
 
     A loss that nobody observes is a random gain, 0 or 1, of kappa = E g^2 / (E g)^2 = 1 / P(arrival). The maps that it
-    may lose take its place in the series.
+    may lose take its place in the series. `parts`: the maps of the series, in the order in which a signal passes them.
 
     Raises:
         ValueError: maps that are neither losses nor of one gain and noise.
