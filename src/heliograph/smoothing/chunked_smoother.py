@@ -8,6 +8,7 @@ Smoother steps stay in the SIMD lane of their chunk.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -27,7 +28,6 @@ from heliograph.filters.rows.chunks import (
 from heliograph.filters.rows.gaussians_in_states import find_equal_states, select_state
 from heliograph.filters.rows.linear_recursion import initial_state_if_linear, scan_chunk
 from heliograph.filters.rows.row_windows import Which, take, take_windows
-from heliograph.filters.rows.settled_covariance import SettledState
 from heliograph.filters.smoother_step import SmootherStep, gaussian_of
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.types import Array, Float, PyTree
@@ -163,15 +163,13 @@ def _smooth_all(recursion: SmootherStepRecursion, chunk_starts: ChunkStarts, row
         choice = choose_code(smooth_chunk, arguments, differs_by_run=[False, True, True, True, True, True, True])
         return None if choice.code is None else choice.results()
 
-    def smooth_means(settled: SettledState) -> SmoothedChunk | None:
-        """Smooth all chunks by their means alone, with the covariances and gains of `settled`."""
-        return smooth_settled_chunks(recursion, settled, chunk_starts, windows)
-
     # Only means are computed in chunks where covariances have settled: their window must be complete, and must not
     # reach beyond the last row.
     first = chunk_starts.first
     is_complete = chunk_starts.complete.are_complete(first, own + ahead) & (first + own + ahead <= total)
     chunk_starts = chunk_starts._replace(covered=chunk_starts.covered & is_complete)
+    # A function of the settled state, by whose covariances and gains it smooths all chunks.
+    smooth_means = partial(smooth_settled_chunks, recursion, chunk_starts=chunk_starts, windows=windows)
     results = scan_means_where_settled(chunk_starts, smooth_chunks_from, smooth_means)
     if results is None:
         return None
