@@ -25,8 +25,8 @@ from heliograph.learning.likelihood.climbs import Evaluated
 from heliograph.learning.likelihood.evaluation import Evaluation, evaluate_recording
 from heliograph.learning.likelihood.objective import Form, Objective, make_objectives
 from heliograph.learning.likelihood.parameter_transforms import from_unconstrained
-from heliograph.learning.likelihood.surface import DIFFERENCE
-from heliograph.learning.likelihood.trust_region import NEAR, maximise_from_starts
+from heliograph.learning.likelihood.surface import DIFFERENCE_WIDTH
+from heliograph.learning.likelihood.trust_region import CONVERGED_GAIN_BY_ROUNDING, maximise_from_starts
 from heliograph.learning.long_run_covariance import (
     Method,
     compute_sandwich_covariance,
@@ -183,9 +183,9 @@ def fit_each(network: Build, z: np.ndarray, u: np.ndarray, form: Form) -> Fits:
     top = outcome(x, z)
     hessian = np.asarray(top.halves).sum(axis=1)
     local = np.diagonal(hessian, axis1=1, axis2=2)
-    inside = (2 * remaining < NEAR) & np.all(local > SEEN, axis=1)
+    inside = (2 * remaining < CONVERGED_GAIN_BY_ROUNDING) & np.all(local > SEEN, axis=1)
     # Hessian by central differences of the scores; the information where it is not concave.
-    width = DIFFERENCE / np.sqrt(np.maximum(local, SEEN))
+    width = DIFFERENCE_WIDTH / np.sqrt(np.maximum(local, SEEN))
     slopes = np.empty(hessian.shape)
     for i in range(x.shape[1]):
         shift = np.zeros(x.shape)

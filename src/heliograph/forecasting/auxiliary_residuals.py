@@ -18,8 +18,8 @@ from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.noises.noise import Gaussian
 
-FALSE = 0.01  # probability of any false shock, of all tests together
-EQUAL = 1e-10  # relative: means and covariances of what is measured and of what arrives that are the same
+FALSE_SHOCK = 0.01  # probability of any false shock, of all tests together
+RELATIVE_ROUNDING = 1e-10  # relative: means and covariances of what is measured and of what arrives that are the same
 ROUNDING = 1e-12  # of a variance, below which nothing is known of a noise
 
 
@@ -51,10 +51,10 @@ class Disturbances:
     Args:
         outputs: names of the outputs, m of them.
         states: names of the states, n of them.
-        output_noise: noise of each output given all data, without its mean (steps, m).
-        output_deviation: its standard deviation (steps, m).
-        state_noise: noise of the plant on the way to each row, without its mean (steps, n).
-        state_deviation: its standard deviation (steps, n).
+        output_noise: smoothed noise of each output, its mean given all data less that before any (steps, m).
+        output_deviation: standard deviation with which that mean varies from one recording to another (steps, m).
+        state_noise: smoothed noise of the plant on the way to each row, likewise (steps, n).
+        state_deviation: standard deviation with which that mean varies (steps, n).
     """
 
     outputs: tuple[str, ...]
@@ -66,17 +66,23 @@ class Disturbances:
 
     @property
     def output_residuals(self) -> Float[np.ndarray, "steps m"]:
-        """Auxiliary residuals of the outputs, noise / deviation (steps, m): normal of variance 1, not independent."""
+        """Auxiliary residuals of the outputs, noise / deviation (steps, m); a large one marks an outlier.
+
+        Where the model is right they are normal of variance 1, but not independent of each other.
+        """
         residuals: np.ndarray = self.output_noise / self.output_deviation
         return residuals
 
     @property
     def state_residuals(self) -> Float[np.ndarray, "steps n"]:
-        """Auxiliary residuals of the states, noise / deviation (steps, n): normal of variance 1, not independent."""
+        """Auxiliary residuals of the states, noise / deviation (steps, n); a large one marks a break of a state.
+
+        Where the model is right they are normal of variance 1, but not independent of each other.
+        """
         residuals: np.ndarray = self.state_noise / self.state_deviation
         return residuals
 
-    def shocks(self, false: float = FALSE) -> list[Shock]:
+    def shocks(self, false: float = FALSE_SHOCK) -> list[Shock]:
         """List the breaks of states and the outliers of outputs in the order of their rows.
 
         Each residual is a test. A break also makes residuals of outputs large, an outlier also those of states, and
@@ -90,7 +96,7 @@ class Disturbances:
         """
         level = float(scalar("false", false, 0, 1))
         residuals = np.concatenate([self.output_residuals, self.state_residuals], axis=1)
-        size = np.nan_to_num(np.abs(residuals))
+        size = np.nan_to_num(np.abs(residuals))  # (steps, m + n); 0 where data say nothing
         # Each finite residual is tested on both sides, and the tests share the probability (Bonferroni).
         tests = 2 * np.isfinite(residuals).sum()
         p = np.minimum(tests * ndtr(-size), 1.0)
@@ -180,13 +186,13 @@ def _require_linear_model(filter: AbstractFilter) -> tuple[LinearPlant, LinearSe
 def _is_received_unchanged(predicted: Forecast) -> bool:
     """Return whether what arrives is predicted as what is measured, as if the channel hands it on unchanged.
 
-    EQUAL: the largest relative difference that counts as rounding.
+    RELATIVE_ROUNDING: the largest relative difference that counts as rounding.
     """
     measured, received = predicted.outputs, predicted.received
     if measured is None or received is None or measured.mean.shape != received.mean.shape:
         return False
-    has_same_covariance = np.allclose(measured.covariance, received.covariance, rtol=EQUAL, atol=0)
-    return has_same_covariance and np.allclose(measured.mean, received.mean, rtol=EQUAL, atol=1e-300)
+    has_same_covariance = np.allclose(measured.covariance, received.covariance, rtol=RELATIVE_ROUNDING, atol=0)
+    return has_same_covariance and np.allclose(measured.mean, received.mean, rtol=RELATIVE_ROUNDING, atol=1e-300)
 
 
 def _smooth_noises(
@@ -222,30 +228,41 @@ def _smooth_noises(
     """
     steps, m = e.shape
     n = len(A)
-    output_mean, output_covariance = np.full((steps, m), np.nan), np.full((steps, m, m), np.nan)
-    plant_mean, plant_covariance = np.full((steps, n), np.nan), np.full((steps, n, n), np.nan)
+    output_mean = np.full((steps, m), np.nan)
+    output_covariance = np.full((steps, m, m), np.nan)
+    plant_mean = np.full((steps, n), np.nan)
+    plant_covariance = np.full((steps, n, n), np.nan)
     is_known = np.isfinite(P).all(axis=(1, 2))  # an unknown start has infinite variances
     first_known = int(np.argmax(is_known)) if is_known.any() else steps
     r, N = np.zeros(n), np.zeros((n, n))
     for k in reversed(range(first_known, steps)):
         arrived = np.flatnonzero(~np.isnan(e[k]))
-        C_k, R_k = C[arrived], R[np.ix_(arrived, arrived)]
+        C_k = C[arrived]
+        R_k = R[np.ix_(arrived, arrived)]
         S = C_k @ P[k] @ C_k.T + R_k
-        weighed, K = np.linalg.solve(S, e[k, arrived]), np.linalg.solve(S, C_k @ P[k]).T  # S^-1 e and K
+        # S^-1 e and K
+        weighed = np.linalg.solve(S, e[k, arrived])
+        K = np.linalg.solve(S, C_k @ P[k]).T
         output_mean[k, arrived] = R_k @ (weighed - K.T @ r)
         output_covariance[k][np.ix_(arrived, arrived)] = R_k @ (np.linalg.inv(S) + K.T @ N @ K) @ R_k
         B = np.eye(n) - K @ C_k
-        r, N = C_k.T @ weighed + B.T @ r, C_k.T @ np.linalg.solve(S, C_k) + B.T @ N @ B
+        r = C_k.T @ weighed + B.T @ r
+        N = C_k.T @ np.linalg.solve(S, C_k) + B.T @ N @ B
         plant_mean[k], plant_covariance[k] = Q @ r, Q @ N @ Q
-        r, N = A.T @ r, A.T @ N @ A
+        r = A.T @ r
+        N = A.T @ N @ A
     return (output_mean, output_covariance), (plant_mean, plant_covariance)
 
 
 def _compute_deviations(mean: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return means (steps, size) and their standard deviations, both NaN where the variance is only rounding.
 
-    `covariance`: (steps, size, size). A variance up to the share ROUNDING of the largest over the steps counts as
+    A variance up to the share ROUNDING of the largest over the steps counts as
     rounding.
+
+    Args:
+        mean: means of a noise given all data (steps, size).
+        covariance: how these means vary where the model is right (steps, size, size).
     """
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     largest = np.max(variance, axis=0, where=np.isfinite(variance), initial=0.0)
@@ -254,7 +271,12 @@ def _compute_deviations(mean: np.ndarray, covariance: np.ndarray) -> tuple[np.nd
 
 
 def _find_peaks(size: np.ndarray, is_candidate: np.ndarray) -> list[int]:
-    """Return, for each run of neighbouring candidate rows, the row with the largest size."""
+    """Return, for each run of neighbouring candidate rows, the row with the largest size.
+
+    Args:
+        size: largest residual of each row (rows,).
+        is_candidate: which rows have a residual that counts as a shock (rows,).
+    """
     rows = np.flatnonzero(is_candidate)
     if not len(rows):
         return []

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import numpy as np
@@ -84,7 +84,8 @@ class Score(NamedTuple):
         means = {"bias": self.bias, "mse": self.mse}
         means |= {f"coverage {level:.0%}": share for level, share in zip(LEVELS, self.coverage, strict=True)}
         means |= {"log score": self.log_score, "crps": self.crps}
-        row: dict[str, object] = {**dict(zip(self._fields[:6], self[:6], strict=True)), "rmse": self.rmse}
+        what_and_how_many = ("node", "filter", "part", "name", "horizon", "compared")
+        row: dict[str, object] = {**{name: getattr(self, name) for name in what_and_how_many}, "rmse": self.rmse}
         for name, mean in means.items():
             row[name], row[f"{name} error"] = mean.value, mean.error
         return row
@@ -181,13 +182,15 @@ def backtest(
     if refit is not None:
         starts = range(first, rows, check_count("every", every))
         networks = {row: _call_refit(refit, row, network) for row in starts}
-    # The filters of each network, in one order; then the scores of each filter over the rows of all networks.
-    data = (measurements, inputs, time, truth)
-    origins = [_find_start_of_forecasts(fitted, record, *data) for fitted in networks.values()]
+    data = _Recording(measurements, inputs, time, truth)
+    origins = [_find_start_of_forecasts(fitted, record, data) for fitted in networks.values()]
+    # Networks have the same filters in the same order: the scores of each filter, as the networks have it in turn.
+    single_filters = list_single_filters(network)
     scores = list[Score]()
-    for of_filter in zip(*(list_targets(origin) for origin in origins), strict=True):
-        if (of_filter[0].node, of_filter[0].filter) in list_single_filters(network):
-            scores += _score_filter(list(zip(networks, of_filter, strict=True)), record, u, ahead, first)
+    for filter_by_network in zip(*(list_targets(origin) for origin in origins), strict=True):
+        target = filter_by_network[0]
+        if (target.node, target.filter) in single_filters:
+            scores += _score_filter(list(zip(networks, filter_by_network, strict=True)), record, u, ahead, first)
     if not scores:
         raise fail("backtest", "a filter that claims a covariance, and data to compare with", "none")
     return Backtest(tuple(ahead), rows, tuple(scores))
@@ -205,23 +208,38 @@ def _call_refit(refit: Refit, rows: int, network: Network) -> Network:
     return fitted
 
 
-def _find_start_of_forecasts(network: Network, record: Record, *data: Any) -> Origin:
-    """Return where a network's forecasts start; if the record is not its own, it is run over the data first."""
+class _Recording(NamedTuple):
+    """The data of a backtest, as `backtest` takes them."""
+
+    measurements: ByNode
+    inputs: Rows
+    time: Rows
+    truth: Rows
+
+
+def _find_start_of_forecasts(network: Network, record: Record, data: _Recording) -> Origin:
+    """Return where a network's forecasts start: its model, and its filters' states after the recording.
+
+    `record` has it if this network made it; a refitted network is run over the data.
+    """
     origin = record.origin
     if not isinstance(origin, Origin) or origin.model is not network:
-        origin = run(network, *data).origin
+        origin = run(network, data.measurements, data.inputs, data.time, data.truth).origin
     assert isinstance(origin, Origin)  # hg.run sets it
     return origin
 
 
 def list_single_filters(network: Network) -> set[tuple[str, str]]:
-    """Return (node, filter) of the estimates that are those of a filter, which can be stepped by itself."""
+    """Return (node, filter) of the estimates made by a filter, which can be stepped by itself, not by a fusion rule."""
     central = {(FUSED, name) for name, fusion in network.fused.items() if hasattr(fusion, "predict")}
     return set(network.estimate_indices) | central
 
 
 def select_measurements(target: ForecastTarget, record: Record) -> np.ndarray:
-    """Return the measurements that a filter receives (steps, received); a central one receives those of all nodes."""
+    """Return the measurements that a filter receives (steps, received); a central one receives those of all nodes.
+
+    A filter that uses no measurements gets an array without columns. `target` is the filter at its node.
+    """
     z = record.measurements.get(target.node)
     if z is None:  # a central filter
         z = np.concatenate([record.measurements[name] for name in record.measurements], axis=1)
@@ -231,8 +249,12 @@ def select_measurements(target: ForecastTarget, record: Record) -> np.ndarray:
 class _ComparedForecasts(NamedTuple):
     """Forecasts from each row, and what came: of the numbers that a filter receives, or of its states.
 
-    part: "received" or "state". names: of the numbers. moments: of their forecasts (rows, horizons, ...). came: the
-    numbers that came (rows, numbers). angles: indices of the angles among them.
+    Args:
+        part: "received" or "state".
+        names: names of the numbers.
+        moments: moments of their forecasts (rows, horizons, ...).
+        came: the numbers that came (rows, numbers), NaN where one did not.
+        angles: indices of the angles among them.
     """
 
     part: str
@@ -240,6 +262,15 @@ class _ComparedForecasts(NamedTuple):
     moments: Moments
     came: np.ndarray
     angles: Sequence[int]
+
+
+class _ScoredNumber(NamedTuple):
+    """A number that is scored: node and filter that forecast it, "state" or "received", and its name."""
+
+    node: str
+    filter: str
+    part: str
+    name: str
 
 
 def _score_filter(
@@ -254,7 +285,7 @@ def _score_filter(
         ahead: horizons, in rows.
         first: first row from which a forecast counts.
     """
-    _, target = segments[0]  # in names and claim all segments are alike
+    _, target = segments[0]  # names and claim are the same in all segments
     filter, node = target.predictor.filter, target.node
     if filter.claim == "none":  # no covariance, so no forecast of a law
         return []
@@ -271,7 +302,7 @@ def _score_filter(
     scores = list[Score]()
     for forecasts in compared:
         for i, name in enumerate(forecasts.names):
-            number = node, target.filter, forecasts.part, name
+            number = _ScoredNumber(node, target.filter, forecasts.part, name)
             came, is_angle = forecasts.came[:, i], i in forecasts.angles
             for j, horizon in enumerate(ahead):
                 law = select_law(forecasts.moments, i, j)
@@ -282,16 +313,26 @@ def _score_filter(
 def _roll_segments(
     segments: list[tuple[int, ForecastTarget]], z: np.ndarray, u: np.ndarray, ahead: list[int]
 ) -> tuple[Moments, Moments | None]:
-    """Return forecasts from each row, as `roll_forecasts` does, by the filter of the segment in which the row lies.
+    """Return the moments of states and received numbers forecast from each row (rows, horizons, K, ...).
 
-    `segments`: (first row, filter as it is from there on); z: measurements, u: inputs, both by row; `ahead`: horizons.
+    Rows are divided into segments, each with its own fit of the filter. Every fit forecasts from all rows, as
+    `roll_forecasts` does, and its forecasts count in its own segment. Received numbers are None if not predicted.
+
+    Args:
+        segments: (first row, filter as it is from there on).
+        z: measurements (rows, received).
+        u: inputs (rows, inputs).
+        ahead: horizons, in rows.
     """
     rolled = [roll_forecasts(target.predictor, z, u, ahead) for _, target in segments]
     ends = [*(row for row, _ in segments[1:]), len(z)]
     begins = [0, *ends[:-1]]
 
     def join(*arrays: np.ndarray) -> np.ndarray:
-        """Return the rows of each segment from the array of its own filter, one segment after the other."""
+        """Return the rows of each segment from the array of its own filter, one segment after the other.
+
+        Segment i has the rows `begins[i]` to `ends[i]` - 1.
+        """
         rows_of_segments = zip(arrays, begins, ends, strict=True)
         return np.concatenate([np.asarray(array)[begin:end] for array, begin, end in rows_of_segments])
 
@@ -300,12 +341,12 @@ def _roll_segments(
 
 
 def _score_number(
-    number: tuple[str, str, str, str], horizon: int, law: MixtureLaws, values: np.ndarray, first: int, is_angle: bool
+    number: _ScoredNumber, horizon: int, law: MixtureLaws, values: np.ndarray, first: int, is_angle: bool
 ) -> Score:
     """Return the score of forecasts from each row of the number `horizon` rows later.
 
     Args:
-        number: node and name of the filter, part ("state" or "received"), and name of the number.
+        number: which number it is, and which filter forecasts it.
         horizon: rows ahead.
         law: the forecast from each row: mixtures of K Gaussians, weights, means and variances (rows, K).
         values: the number in each row (rows,), NaN where it did not come.
@@ -313,23 +354,26 @@ def _score_number(
         is_angle: whether it is an angle.
     """
     # The forecasts that count, and the values that came `horizon` rows later.
-    law, came = MixtureLaws(*(part[first:-horizon] for part in law)), values[first + horizon :]
+    law = MixtureLaws(*(part[first:-horizon] for part in law))
+    came = values[first + horizon :]
     # An angle is taken within half a turn of its forecast.
     came = law.mean + wrap_angles((came - law.mean)[:, None], (0,) if is_angle else ())[:, 0]
     # Nothing was forecast yet where the start is unknown (infinite variances).
     came = np.where(np.isfinite(law.variances).all(axis=1), came, np.nan)
-    error, probability_below = came - law.mean, compute_probability_below(law, came)
+    error = came - law.mean
+    probability_below = compute_probability_below(law, came)  # P(X < value)
     nan_if_absent = np.where(np.isnan(error), np.nan, 0.0)  # added to 0 or 1, so that absent rows do not count
-    # A value that the forecast knows for certain is within any interval: it does not test the share within.
-    absent_or_known = np.where(is_known_and_came(law, came), np.nan, nan_if_absent)
-    in_middle = {level: (np.abs(probability_below - 0.5) <= level / 2) + absent_or_known for level in LEVELS}
+    # A value that the forecast knows for certain is within any interval, so it does not test the share within.
+    nan_if_untested = np.where(is_known_and_came(law, came), np.nan, nan_if_absent)
+    # It is within the central interval of probability p if P(X < value) lies between (1 - p) / 2 and (1 + p) / 2.
+    is_inside_by_level = {level: (np.abs(probability_below - 0.5) <= level / 2) + nan_if_untested for level in LEVELS}
     return Score(
-        *number,
+        **number._asdict(),
         horizon=horizon,
         compared=int(np.sum(~np.isnan(error))),
         bias=average_overlapping(error, horizon),
         mse=average_overlapping(error**2, horizon),
-        coverage=tuple(average_coverage(is_inside, horizon, level) for level, is_inside in in_middle.items()),
+        coverage=tuple(average_coverage(is_inside, horizon, level) for level, is_inside in is_inside_by_level.items()),
         log_score=average_overlapping(log_score(law, came), horizon),
         crps=average_overlapping(crps(law, came), horizon),
     )

@@ -9,24 +9,21 @@ import numpy as np
 from heliograph.factors.factored_gaussian import from_covariance
 from heliograph.filters.base import AbstractFilter, FilterAngles
 from heliograph.filters.gaussian.gaussian_prediction import open_loop_filter
+from heliograph.filters.wrappers.sensor_inputs import FilterOfInputs
+from heliograph.filters.wrappers.state_limits import LimitedFilter
+from heliograph.filters.wrappers.told_link_law import ToldFilter
 from heliograph.forecasting.forecast_result import Forecast, InputsAhead
 from heliograph.forecasting.horizons import Horizons, Inputs, RowsAhead, check_inputs_ahead, find_rows_ahead
 from heliograph.forecasting.mixture_moments import Moments, make_prediction
-from heliograph.forecasting.multistep_prediction import (
-    MultistepPredictor,
-    find_output_claim,
-    find_received_claim,
-    make_multistep_predictor,
-    predict_moments,
-    predict_moments_of_each,
-)
+from heliograph.forecasting.multistep_prediction import MultistepPredictor, make_multistep_predictor
+from heliograph.forecasting.predicted_moments import predict_moments, predict_moments_of_each
 from heliograph.forecasting.start_states import Sources, find_common_origin
 from heliograph.model.augmented.joint_sensors import joint_sensor
-from heliograph.model.estimate import Estimate, weakest
+from heliograph.model.estimate import Claim, Estimate, weakest
 from heliograph.model.forecast_origin import Origin
 from heliograph.model.over_time import first
 from heliograph.model.plant import LinearPlant
-from heliograph.model.sensor import AbstractSensor, AnySensor
+from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import compile_in_float64
 from heliograph.numerics.types import PyTree
@@ -84,9 +81,12 @@ def forecast_from_origin(origin: Origin, horizons: Horizons, inputs: Inputs) -> 
 class ForecastTarget(NamedTuple):
     """An estimate that is forecast.
 
-    node, filter: names of its node and filter. predictor: predicts the filter's state without data, and reads states,
-    outputs and received numbers from it. state: the filter's state where the data end. received: names of the numbers
-    that the filter receives.
+    Args:
+        node: name of its node; "" of a single filter.
+        filter: name of its filter; "" of a single filter.
+        predictor: predicts the filter's state without data, and reads states, outputs and received numbers from it.
+        state: the filter's state where the data end.
+        received: names of the numbers that the filter receives.
     """
 
     node: str
@@ -98,6 +98,11 @@ class ForecastTarget(NamedTuple):
 
 def find_target(origin: Origin, node: str | None, filter: str | None) -> ForecastTarget:
     """Return the estimate of this node and filter; a None matches any, but only one estimate may match.
+
+    Args:
+        origin: where the data end, with the estimates there.
+        node: name of the node, or None.
+        filter: name of the filter, or None.
 
     Raises:
         ValueError: no estimate matches, or several do.
@@ -114,7 +119,8 @@ def find_target(origin: Origin, node: str | None, filter: str | None) -> Forecas
 def list_targets(origin: Origin) -> list[ForecastTarget]:
     """Return what is forecast from an origin: each of its estimates, with the filter and state that are predicted.
 
-    A single filter has one, of node and filter "".
+    `origin` is where the data end: a network with its filters' states and estimates, or a single filter with its state,
+    which has one target, of node and filter "".
     """
     model = origin.model
     if isinstance(model, AbstractFilter):
@@ -151,7 +157,8 @@ def _find_filter(
     """
     states_by_stack, states_of_central, *_ = origin.state
     if (node, name) in network.estimate_indices:
-        # In a stack, of filters of one structure: filter after filter, and for each the nodes of the stack's group.
+        # States of filters of one structure are stacked: those of the first filter at each node of the stack's group,
+        # then those of the next filter.
         stack, filter_of_stack, node_of_group = network.estimate_indices[node, name]
         nodes_in_group = len(network.groups[network.stacks[stack].group])
         index = filter_of_stack * nodes_in_group + node_of_group
@@ -164,18 +171,23 @@ def _find_filter(
 
 
 def _take_stacked_state(stacked: PyTree, index: int, several: bool) -> PyTree:
-    """Return one of the states that are stacked along the first axis, or along the second if the first is of plants.
+    """Return the state number `index` of stacked states.
 
-    `several` is True if there are several plants, which then have the first axis.
+    They are stacked along the first axis; if there are `several` plants these have the first, and states the second.
     """
     return jax.tree.map(lambda leaf: np.take(leaf, index, axis=int(several)), stacked)
 
 
 def _predict_without_nodes(network: Network, estimate: Estimate) -> tuple[AbstractFilter, PyTree]:
-    """Return a filter that only predicts, and its state at a fused estimate.
+    """Return a filter that only predicts, and its state: the law with the mean and covariance of a fused estimate.
 
-    It has the claim of the estimate, lowered to "nominal" if the prediction is approximate: if the plant is not linear
-    or has angles.
+    A fusion rule combines estimates and has no state of its own, so its forecast is the plant's motion from there. The
+    filter has the claim of the estimate, lowered to "nominal" if the prediction is approximate: if the plant is not
+    linear or has angles.
+
+    Args:
+        network: the network, for its plant.
+        estimate: the fused estimate where the data end.
     """
     plant = first(network.plant)
     is_exact = isinstance(plant, LinearPlant) and not plant.circular
@@ -184,7 +196,8 @@ def _predict_without_nodes(network: Network, estimate: Estimate) -> tuple[Abstra
     with_claim = replace(filter, claim=claim)
     # `replace` does not copy `kept`, and the filter is frozen.
     object.__setattr__(with_claim, "kept", filter.kept)
-    mean, covariance = np.asarray(estimate.mean), np.asarray(estimate.covariance)
+    mean = np.asarray(estimate.mean)
+    covariance = np.asarray(estimate.covariance)
     if claim == "none":
         covariance = np.zeros_like(covariance)
     make_state = from_covariance if mean.ndim == 1 else _factor_each
@@ -195,7 +208,10 @@ _factor_each = compile_in_float64(jax.vmap(lambda mean, covariance: from_covaria
 
 
 def _find_sensor(network: Network, node: str) -> AnySensor | None:
-    """Return the sensor of a node, or for FUSED (all nodes together) the joint one; None without constant sensors."""
+    """Return the sensor of a node, or for FUSED (all nodes together) the joint one.
+
+    None if a node has no sensor of its own, or if there is no joint one because a sensor varies over time.
+    """
     if node != FUSED:
         single = network.nodes[node]
         return single.sensor if isinstance(single, Node) else None
@@ -215,10 +231,14 @@ def _name_received(network: Network, node: str) -> tuple[str, ...]:
 
 
 def check_steps_covered(filter: AbstractFilter, step: int | np.ndarray, count: int) -> None:
-    """Raise ValueError if what varies over time ends earlier than `count` steps after `step`."""
-    last_step = int(np.max(step))
-    if filter.horizon is not None and last_step + count > filter.horizon:
-        covered = max(filter.horizon - last_step, 0)
+    """Raise ValueError if models that vary over time do not cover `count` steps from the step number `step` on.
+
+    `step`: number of the first step ahead, or one for each plant. `filter.horizon`: how many steps the models cover,
+    None if they do not vary.
+    """
+    first_ahead = int(np.max(step))  # of several plants that of the one that is furthest on
+    if filter.horizon is not None and first_ahead + count > filter.horizon:
+        covered = max(filter.horizon - first_ahead, 0)
         raise fail("horizons", f"at most {covered} steps, which the model covers beyond the data", count)
 
 
@@ -273,10 +293,10 @@ def combine_predictions(
     # Each prediction gets its own claim, and its angles between -pi and pi.
     predicted_outputs = predicted_received = None
     if outputs is not None:
-        output_claim = find_output_claim(filter, predictor)
+        output_claim = _find_output_claim(filter, predictor)
         predicted_outputs = make_prediction(outputs, tuple(sensor.outputs), output_claim, sensor.angles)
     if received is not None:
-        received_claim = find_received_claim(filter)
+        received_claim = _find_received_claim(filter)
         predicted_received = make_prediction(received, received_names, received_claim, angles.received)
     return Forecast(
         steps=steps,
@@ -286,3 +306,32 @@ def combine_predictions(
         received=predicted_received,
         inputs=inputs,
     )
+
+
+def _find_output_claim(filter: AbstractFilter, predictor: MultistepPredictor) -> Claim:
+    """Return the claim of the predicted outputs: what their covariance is said to be.
+
+    It is that of the filter, "exact", "upper", "nominal" or "none". Moments through a nonlinear sensor, and those of
+    angles, are approximate: the claim is at most "nominal" then.
+
+    Args:
+        filter: the filter.
+        predictor: predicts its states and outputs; has the sensor.
+    """
+    sensor = first(predictor.sensor)
+    is_exact = isinstance(sensor, LinearSensor) and not sensor.circular
+    return filter.claim if is_exact or filter.claim == "none" else weakest([filter.claim, "nominal"])
+
+
+def _find_received_claim(filter: AbstractFilter) -> Claim:
+    """Return the claim of what is predicted to arrive: the filter's, or "nominal" if example numbers stand for unknown.
+
+    A `ToldFilter` receives numbers with each message that determine the link's law, such as a noise variance. They are
+    not known ahead. Unless their own law is known, an example of them is used, with which the covariance is nominal.
+    """
+    base = filter
+    while isinstance(base, LimitedFilter | FilterOfInputs):
+        base = base.base
+    if isinstance(base, ToldFilter) and not base.knows_law_of_numbers and filter.claim != "none":
+        return weakest([filter.claim, "nominal"])
+    return filter.claim

@@ -13,7 +13,7 @@ from heliograph.numerics.check import array, fail, is_whole, scalar, show_value
 from heliograph.numerics.module import readable
 from heliograph.numerics.types import ArrayLike, Float
 
-HALVINGS = 80  # of a bracket of a quantile: from some deviations to the last digit
+BISECTIONS = 80  # of a bracket of a quantile: from some deviations to the last digit
 Array = TypeAliasType("Array", np.ndarray)
 InputsAhead: TypeAlias = Literal["none", "given", "held"]
 
@@ -69,15 +69,17 @@ class Prediction:
         means, deviations = self.part_means, np.sqrt(self.part_variances)
         low_end, high_end = np.transpose(self.limits)
         with np.errstate(invalid="ignore"):  # no median of what is unknown
-            below_low, below_high = self._find_part_probabilities(low_end), self._find_part_probabilities(high_end)
+            below_low = self._find_part_probabilities(low_end)
+            below_high = self._find_part_probabilities(high_end)
             probabilities = below_low + p * (below_high - below_low)
             quantiles = np.clip(means + ndtri(probabilities) * deviations, low_end, high_end)  # of each part
         # The mixture's lies between the least and the greatest of its parts': halve that interval.
         low, high = quantiles.min(axis=-2), quantiles.max(axis=-2)
-        for _ in range(HALVINGS if means.shape[-2] > 1 else 0):
+        for _ in range(BISECTIONS if means.shape[-2] > 1 else 0):
             middle = (low + high) / 2
             is_below = self._find_probability_below(middle) < p
-            low, high = np.where(is_below, middle, low), np.where(is_below, high, middle)
+            low = np.where(is_below, middle, low)
+            high = np.where(is_below, high, middle)
         return np.where(np.isnan(self.deviation), np.nan, (low + high) / 2)
 
     def interval(self, coverage: float = 0.95) -> tuple[np.ndarray, np.ndarray]:
@@ -127,11 +129,13 @@ class Prediction:
         low, high = np.transpose(self.limits)
         # P(x_k < value), P(x_k < low) and P(x_k < high), each (horizons, K, m).
         below = self._find_part_probabilities(np.clip(values, low, high))
-        below_low, below_high = self._find_part_probabilities(low), self._find_part_probabilities(high)
+        below_low = self._find_part_probabilities(low)
+        below_high = self._find_part_probabilities(high)
         inside = below_high - below_low
         conditional = np.where(inside > 0, (below - below_low) / np.where(inside > 0, inside, 1.0), below)
         # No probability is beyond the limits, even if a part is almost certainly there.
-        is_at_low, is_beyond_high = (values <= low)[..., None, :], (values > high)[..., None, :]
+        is_at_low = (values <= low)[..., None, :]
+        is_beyond_high = (values > high)[..., None, :]
         conditional = np.where(is_at_low, 0.0, np.where(is_beyond_high, 1.0, conditional))
         total: np.ndarray = np.sum(self.weights * conditional, axis=-2)
         return total

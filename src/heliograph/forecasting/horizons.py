@@ -18,11 +18,11 @@ from heliograph.numerics.types import ArrayLike, Float, units_in
 Horizon = int | float | timedelta | datetime | np.timedelta64 | np.datetime64
 Horizons = TypeAliasType("Horizons", Horizon | Sequence[Horizon] | np.ndarray)
 Inputs = TypeAliasType("Inputs", ArrayLike | Literal["held"] | None)  # rows ahead
-SECOND = 1e9  # nanoseconds
-MONTHS = {"Y": 12, "M": 1}  # in NumPy's units of time that have no length in seconds
-OFF = 0.25  # of a step: months and years differ by less from the usual one
-LONGEST = 1_000_000  # steps ahead
-FARTHEST = 1e15  # seconds, 30 million years: further than any date, and held by 64 bits
+NANOSECONDS = 1e9  # nanoseconds
+MONTHS_OF_UNIT = {"Y": 12, "M": 1}  # in NumPy's units of time that have no length in seconds
+LARGEST_MISFIT = 0.25  # of a step: months and years differ by less from the usual one
+MOST_STEPS_AHEAD = 1_000_000  # steps ahead
+MOST_SECONDS_AHEAD = 1e15  # seconds, 30 million years: further than any date, and held by 64 bits
 
 
 @runtime_checkable
@@ -37,11 +37,12 @@ class HasInputs(Protocol):
 class RowsAhead(NamedTuple):
     """Rows to predict over, and which of them the horizons are.
 
-    u: inputs of each row. rows: number of the row that ends at each horizon. steps: how far each horizon is, in steps
-    or in the unit of dt. time: of each, on the clock of the data. inputs: whether they are "given", "held" or there
-    are none.
-
-    Of several plants u and time have a leading axis.
+    Args:
+        u: inputs of each row ([plants,] rows, inputs); the leading axis is there only of several plants.
+        rows: index of the row that ends at each horizon (horizons,).
+        steps: how far each horizon is (horizons,), in steps or in the unit of the input dt.
+        time: time of each horizon on the clock of the data, numbers or dates ([plants,] horizons).
+        inputs: whether u was "given", repeats the last inputs ("held"), or the plant has none but dt ("none").
     """
 
     u: Float[np.ndarray, "... rows inputs"]
@@ -52,7 +53,7 @@ class RowsAhead(NamedTuple):
 
 
 def find_rows_ahead(origin: Origin, names: Sequence[str], horizons: Horizons, inputs: Inputs) -> RowsAhead:
-    """Return the rows of inputs over which a filter predicts from an origin to each horizon.
+    """Return the rows of inputs over which a filter predicts from an origin, and which of these rows the horizons are.
 
     Where time counts steps there is one row for each step. Where the plant has an input dt (time is continuous), there
     is one row for each horizon, with dt from the horizon before.
@@ -89,6 +90,10 @@ def _convert_to_steps(origin: Origin, horizons: Horizons) -> np.ndarray:
     """Return how many steps ahead each horizon is (horizons,), from numbers of steps, spans of time, or dates.
 
     A single whole number stands for each step up to it.
+
+    Args:
+        origin: where the data end: time of the last row, and time between rows.
+        horizons: a number of steps, or a list of steps, spans of time or dates.
     """
     if is_whole(horizons):
         return np.arange(1.0, _require_step_count(horizons) + 1)
@@ -97,6 +102,11 @@ def _convert_to_steps(origin: Origin, horizons: Horizons) -> np.ndarray:
 
 def _convert_horizon_to_steps(origin: Origin, horizon: object) -> float:
     """Return how many steps ahead one horizon is: a number of steps, a span of time or a date.
+
+    Args:
+        origin: where the data end: `time` of the last row, and `spacing` between rows in seconds, or `months` where
+            steps are whole months.
+        horizon: a number of steps, a span of time or a date.
 
     Raises:
         ValueError: no whole number of steps, or a time where that of a step is not known.
@@ -114,17 +124,22 @@ def _convert_horizon_to_steps(origin: Origin, horizon: object) -> float:
     if not origin.spacing > 0:
         raise fail("horizons", "numbers of steps, where the time between them is not known", show_value(horizon))
     count = seconds / origin.spacing
-    if abs(count - round(count)) > OFF:
+    if abs(count - round(count)) > LARGEST_MISFIT:
         expected = f"whole steps of {origin.spacing:g} s"
         raise fail("horizons", expected, f"{show_value(horizon)}, {count:.4g} steps ahead")
     return float(round(count))
 
 
 def _count_months(origin: Origin, horizon: object) -> int | None:
-    """Return how many calendar months ahead a date, or a span of months or years, is; None for anything else."""
+    """Return how many calendar months ahead a date, or a span of months or years, is; None for anything else.
+
+    Args:
+        origin: where the data end, for the date of the last row.
+        horizon: a date, a span of time or a number.
+    """
     if isinstance(horizon, np.timedelta64):
         unit, size = np.datetime_data(horizon)
-        return int(horizon.astype(np.int64)) * size * MONTHS[unit] if unit in MONTHS else None
+        return int(horizon.astype(np.int64)) * size * MONTHS_OF_UNIT[unit] if unit in MONTHS_OF_UNIT else None
     if not isinstance(horizon, datetime | np.datetime64):
         return None
     date, end = _read_date_ahead(origin, horizon)
@@ -135,6 +150,10 @@ def _convert_to_times(origin: Origin, horizons: Horizons) -> np.ndarray:
     """Return how far ahead each horizon is (horizons,), in the unit of dt; spans of time and dates give seconds.
 
     A single whole number stands for each step of the usual size up to it.
+
+    Args:
+        origin: where the data end: `time` of the last row, and the usual time between rows (`spacing`).
+        horizons: a number of steps, or a list of numbers in the unit of dt, spans of time or dates.
     """
     if is_whole(horizons):
         if not origin.spacing > 0:
@@ -148,15 +167,18 @@ def _convert_to_times(origin: Origin, horizons: Horizons) -> np.ndarray:
 
 
 def _require_step_count(value: object) -> int:
-    """Return a number of steps ahead; raise ValueError if it is above LONGEST, a million."""
+    """Return a number of steps ahead; raise ValueError if it is above MOST_STEPS_AHEAD, a million."""
     count = check_count("horizons", value)
-    if count > LONGEST:
-        raise fail("horizons", f"at most {LONGEST:,} steps", count)
+    if count > MOST_STEPS_AHEAD:
+        raise fail("horizons", f"at most {MOST_STEPS_AHEAD:,} steps", count)
     return count
 
 
 def _list_horizons(horizons: object) -> list[object]:
-    """Return horizons as a list; a single time or date gives a list of one."""
+    """Return horizons as a list; a single time or date gives a list of one.
+
+    A list of anything is checked later, horizon by horizon.
+    """
     if isinstance(horizons, float | timedelta | datetime | np.timedelta64 | np.datetime64):
         return [horizons]
     values = list(cast(Iterable[object], horizons)) if rank("horizons", horizons) == 1 else []
@@ -168,7 +190,11 @@ def _list_horizons(horizons: object) -> list[object]:
 def _convert_to_seconds(origin: Origin, horizon: object) -> float | None:
     """Return how many seconds ahead a span of time or a date is; None of a number.
 
-    TIME_STEP: the input dt, the time to the next step; a span or date needs it in seconds. SECOND: nanoseconds.
+    If the plant has an input dt (TIME_STEP), the time to the next step, its unit has to be seconds.
+
+    Args:
+        origin: where the data end: its model, whose inputs may say the unit of dt, and the time of the last row.
+        horizon: a span of time, a date or a number.
     """
     if isinstance(horizon, timedelta | np.timedelta64):
         unit = units_in(origin.model.inputs).get(TIME_STEP, "s") if isinstance(origin.model, HasInputs) else "s"
@@ -179,27 +205,35 @@ def _convert_to_seconds(origin: Origin, horizon: object) -> float | None:
         return None
     date, end = _read_date_ahead(origin, horizon)
     # As Python's integers: 64 bits of nanoseconds hold dates of six centuries, but spans of three.
-    return (int(date.astype(np.int64)) - int(end.astype(np.int64))) / SECOND
+    return (int(date.astype(np.int64)) - int(end.astype(np.int64))) / NANOSECONDS
 
 
 def _read_date_ahead(origin: Origin, horizon: datetime | np.datetime64) -> tuple[np.datetime64, np.datetime64]:
     """Return a date ahead and the date at which the data end, both in nanoseconds.
 
+    Args:
+        origin: where the data end.
+        horizon: the date.
+
     Raises:
         ValueError: a date that is missing or not after the data, or that 64 bits of nanoseconds cannot say.
     """
-    date, end = check_dates("horizons", [horizon])[0], _find_end_of_data(origin, horizon).astype("datetime64[ns]")
+    (date,) = check_dates("horizons", [horizon])
+    end = _find_end_of_data(origin, horizon).astype("datetime64[ns]")
     if not date > end:  # nor is NaT
         raise fail("horizons", f"dates after the data, which end at {end}", show_value(horizon))
     return date, end
 
 
 def _convert_span_to_seconds(span: timedelta | np.timedelta64) -> float:
-    """Return a span of time in seconds; raise ValueError if it is missing, has no unit, or is of months or years."""
+    """Return a span of time in seconds; raise ValueError if it is missing, has no unit, or is of months or years.
+
+    A month has no length in seconds; a span that NumPy writes without a unit has none either.
+    """
     if isinstance(span, timedelta):
         return span.total_seconds()
     unit, size = np.datetime_data(span)
-    if unit == "generic" or unit in MONTHS or np.isnat(span):
+    if unit == "generic" or unit in MONTHS_OF_UNIT or np.isnat(span):
         raise fail("horizons", "spans of weeks or shorter units: a month has no length in seconds", show_value(span))
     # Compute with Python's integers, since NumPy's would overflow.
     seconds = float(np.array(1, f"timedelta64[{unit}]") / np.timedelta64(1, "s"))
@@ -208,6 +242,10 @@ def _convert_span_to_seconds(span: timedelta | np.timedelta64) -> float:
 
 def _find_end_of_data(origin: Origin, horizon: datetime | np.datetime64) -> np.datetime64:
     """Return the date at which the data end, which must be the same for all sources.
+
+    Args:
+        origin: where the data end; several sources have a time each.
+        horizon: the horizon that asks for it, for messages.
 
     Raises:
         ValueError: data without dates, or sources that end at different dates.
@@ -261,7 +299,13 @@ def _complete_inputs(
 def check_inputs_ahead(names: Sequence[str], ahead: RowsAhead, models: object, step: int | np.ndarray) -> None:
     """Raise ValueError if a function of the models returns an invalid value for the inputs ahead.
 
-    `names`: names of the inputs. `step`: number of the last row, or one for each plant.
+    Models may hold functions of the inputs, such as a matrix A(u). They are called with each row of `ahead.u`.
+
+    Args:
+        names: names of the inputs.
+        ahead: the rows ahead with their inputs.
+        models: a tree of plant, sensor and channel, or a filter that holds them.
+        step: number of the first row ahead, or one for each plant.
     """
     count, width = ahead.u.shape[-2:]
     if width:
@@ -272,10 +316,11 @@ def check_inputs_ahead(names: Sequence[str], ahead: RowsAhead, models: object, s
 def _place_on_clock(origin: Origin, distances: np.ndarray, continuous: bool) -> np.ndarray:
     """Return the time of each horizon on the clock of the data ([plants,] horizons): numbers or dates.
 
-    `distances`: how far ahead each is, in steps or if `continuous` in the unit of dt.
-
-    `spacing`: length of a step, of dates in seconds, NaN where none is usual; `months`: how many whole months a
-    step has, 0 if it is none.
+    Args:
+        origin: where the data end: `time` of the last row; `spacing`, the length of a step, of dates in seconds, NaN
+            where none is usual; `months`, how many whole months a step has, 0 if it is none.
+        distances: how far ahead each horizon is (horizons,), in steps or if `continuous` in the unit of dt.
+        continuous: whether the plant has an input dt, the time to the next step.
     """
     spacing = 1.0 if continuous else origin.spacing
     end = np.asarray(origin.time)[..., None]
@@ -287,9 +332,14 @@ def _place_on_clock(origin: Origin, distances: np.ndarray, continuous: bool) -> 
         return check_dates("horizons", last + ahead)
     if np.isnan(spacing):
         return np.full((*end.shape[:-1], len(distances)), np.datetime64("NaT", "ns"))
-    # Whole seconds first, in which no date overflows, then the rest, less than two: nanoseconds end in 2262.
-    seconds, rounded_up = np.minimum(spacing * distances, FARTHEST), np.timedelta64(2, "s")
-    last, whole = end.astype("datetime64[s]"), np.floor(seconds)
-    dates = check_dates("horizons", last + whole.astype(np.int64).astype("timedelta64[s]") + rounded_up) - rounded_up
-    rest = np.round(SECOND * (seconds - whole)).astype(np.int64).astype("timedelta64[ns]")
-    return np.asarray(dates + (end.astype("datetime64[ns]") - last) + rest)
+    # The result is in nanoseconds, which end in 2262. Whole seconds are added first, as in seconds no date overflows.
+    # `check_dates` tests the sum with 2 s to spare, as the fractions of the end and of the distance are added last.
+    seconds = np.minimum(spacing * distances, MOST_SECONDS_AHEAD)
+    whole_seconds = np.floor(seconds)
+    last_second = end.astype("datetime64[s]")
+    spare = np.timedelta64(2, "s")
+    dates = last_second + whole_seconds.astype(np.int64).astype("timedelta64[s]")
+    checked = check_dates("horizons", dates + spare) - spare
+    fraction_of_end = end.astype("datetime64[ns]") - last_second
+    fraction = np.round(NANOSECONDS * (seconds - whole_seconds)).astype(np.int64).astype("timedelta64[ns]")
+    return np.asarray(checked + fraction_of_end + fraction)

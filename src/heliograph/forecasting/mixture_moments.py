@@ -40,7 +40,10 @@ class Moments(NamedTuple):
 
 
 def spread_over_branches(weights: Array, means: Array, variances: Array, branches: GaussianBranches) -> MarginalLaws:
-    """Return the laws of numbers plus a noise that is a mixture of Gaussians: one part for each pair of parts.
+    """Return the law of each number x + noise, where x is a mixture of K Gaussians and the noise one of J.
+
+    The sum is a mixture of K J Gaussians: pair (k, j) has the product of the weights, and the sums of the means and of
+    the variances.
 
     Args:
         weights: weights (K,) of the parts of the numbers without the noise.
@@ -48,10 +51,10 @@ def spread_over_branches(weights: Array, means: Array, variances: Array, branche
         variances: variances (K, m) of each number in each part, without the noise.
         branches: log shares, means and variances (m, J) of the noise's Gaussians, about its mean.
     """
-    share, mean, variance = (jnp.asarray(one).T for one in branches)  # (J, m)
-    pairs = (len(weights) * len(share), means.shape[-1])
+    log_share, mean, variance = (jnp.asarray(one).T for one in branches)  # (J, m)
+    pairs = (len(weights) * len(log_share), means.shape[-1])  # (K J, m)
     return MarginalLaws(
-        weights=(jnp.asarray(weights)[:, None, None] * jnp.exp(share)).reshape(pairs),
+        weights=(jnp.asarray(weights)[:, None, None] * jnp.exp(log_share)).reshape(pairs),
         means=(jnp.asarray(means)[:, None] + mean).reshape(pairs),
         variances=(jnp.asarray(variances)[:, None] + variance).reshape(pairs),
     )
@@ -60,6 +63,24 @@ def spread_over_branches(weights: Array, means: Array, variances: Array, branche
 def has_branches(branches: GaussianBranches) -> bool:
     """Return whether a noise has several branches, so that it is not Gaussian."""
     return int(np.shape(branches.mean)[1]) > 1
+
+
+def _compute_mean_and_covariance(
+    weights: np.ndarray, means: np.ndarray, covariances: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean m (..., m) and covariance P (..., m, m) of a mixture of K Gaussians.
+
+    m = sum_k w_k m_k and P = sum_k w_k (P_k + (m_k - m) (m_k - m)').
+
+    Args:
+        weights: w_k (..., K).
+        means: m_k (..., K, m).
+        covariances: P_k (..., K, m, m).
+    """
+    mean = np.einsum("...k,...km->...m", weights, means)
+    distances = means - mean[..., None, :]
+    within = np.einsum("...k,...kij->...ij", weights, covariances)
+    return mean, within + np.einsum("...k,...ki,...kj->...ij", weights, distances, distances)
 
 
 def make_prediction(
@@ -81,15 +102,13 @@ def make_prediction(
     weights, means, covariances = map(np.asarray, moments[:3])
     variances = np.maximum(np.diagonal(covariances, axis1=-2, axis2=-1), 0.0)
     means = wrap_near(means, means[..., :1, :], angles)  # within half a turn of the first part, to be averaged
-    # Moments of the mixture: mean = sum_k w_k m_k, covariance = sum_k w_k (P_k + (m_k - mean) (m_k - mean)').
-    mean = np.einsum("...k,...km->...m", weights, means)
-    apart = means - mean[..., None, :]
-    within = np.einsum("...k,...kij->...ij", weights, covariances)
-    covariance = within + np.einsum("...k,...ki,...kj->...ij", weights, apart, apart)
+    mean, covariance = _compute_mean_and_covariance(weights, means, covariances)
     if claim == "none":
-        covariance, variances = np.full_like(covariance, np.nan), np.full_like(variances, np.nan)
+        covariance = np.full_like(covariance, np.nan)
+        variances = np.full_like(variances, np.nan)
     # The law of each number by itself: of these parts, or that in `laws`, whose variances count where one is known.
-    law_weights, law_means = np.broadcast_to(weights[..., None], means.shape), means
+    law_weights = np.broadcast_to(weights[..., None], means.shape)
+    law_means = means
     if moments.laws is not None:
         law_weights, law_means, law_variances = map(np.asarray, moments.laws)
         law_means = wrap_near(law_means, mean[..., None, :], angles)
@@ -98,9 +117,9 @@ def make_prediction(
     # Angles of the mean come to -pi ... pi, and the parts' means move by the same whole turns.
     wrapped = wrap_angles(mean, angles)
     whole_turns = (wrapped - mean)[..., None, :]
-    ends = np.tile([-np.inf, np.inf], (len(names), 1))
-    for place, *interval in limits:
-        ends[place] = interval
+    ends = np.tile([-np.inf, np.inf], (len(names), 1))  # lowest and highest value of each number
+    for index, low, high in limits:
+        ends[index] = low, high
     return Prediction(
         names=names,
         mean=wrapped,

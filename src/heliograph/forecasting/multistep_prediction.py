@@ -9,9 +9,9 @@ from typing import Protocol, runtime_checkable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from heliograph.engine.choice import choose_code, compile_on_call, compute_once
+from heliograph.engine.choice import compile_on_call
+from heliograph.factors.covariance_factors import WeightedColumns
 from heliograph.factors.diffuse_gaussian import Diffuse, mark_unknown, project_diffuse
 from heliograph.factors.factored_gaussian import Gaussian, from_covariance, take_leading
 from heliograph.filters.base import AbstractFilter
@@ -29,20 +29,17 @@ from heliograph.filters.wrappers.sensor_inputs import FilterOfInputs
 from heliograph.filters.wrappers.state_limits import LimitedFilter
 from heliograph.filters.wrappers.told_link_law import ToldFilter
 from heliograph.forecasting.mixture_moments import MarginalLaws, Moments, has_branches, spread_over_branches
-from heliograph.model.estimate import Claim, Innovation, weakest
+from heliograph.model.estimate import Innovation
 from heliograph.model.fading import without_memory
 from heliograph.model.over_time import OverTime, at, at_each_step, first
-from heliograph.model.plant import AnyPlant
-from heliograph.model.sensor import AnySensor, LinearSensor
-from heliograph.numerics.float64 import quickly_compiled, to_numpy
+from heliograph.model.plant import AbstractPlant, AnyPlant
+from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
 from heliograph.random_affine.memories_of_channels import memories
 from heliograph.random_affine.moments.mixture_components import GaussianBranches
 from heliograph.random_affine.noises.noise import AbstractNoise
 from heliograph.random_affine.noises.outlier_noise import StudentT
-
-BLOCK = 128  # plants side by side under XLA
 
 
 @runtime_checkable
@@ -57,8 +54,16 @@ class HasComponents(Protocol):
 class MultistepPredictor(Module):
     """Predicts a filter's state step by step without data, and reads moments from it.
 
-    plant, sensor: what is measured; without them no outputs are predicted. transform: takes moments through a nonlinear
-    sensor. receives: whether received numbers are predicted. received_noise: their noise if it has outliers, else None.
+    Three kinds of numbers are predicted: the plant's states, the outputs that its sensor would measure, and the numbers
+    that would be received of these through the channel.
+
+    Args:
+        filter: the filter whose state is predicted.
+        plant: the plant, for the outputs; None if it is not known.
+        sensor: the sensor of the outputs; None if it is not known, and no outputs are predicted.
+        transform: takes mean and covariance through a nonlinear sensor.
+        receives: whether received numbers are predicted.
+        received_noise: noise in the received numbers if it has outliers, else None.
     """
 
     filter: AbstractFilter
@@ -72,14 +77,15 @@ class MultistepPredictor(Module):
         """Return the moments of the plant's states as a mixture of K Gaussians: K = 1 unless the filter has a mixture.
 
         Covariances are zero if the filter claims none. If states have limits, the moments are those given that all
-        limits hold.
+        limits hold. `state`: the filter's state.
         """
         filter = self.filter
         if not isinstance(filter, LimitedFilter):
             return self._read_moments(filter, state)
         moments = self._read_moments(filter.base, filter.condition_on_limits(state))
         # The law of each limited state: Gaussians given the limits of the other states, later cut to its own limits.
-        means, variances = moments.means, jnp.diagonal(moments.covariances, axis1=-2, axis2=-1)
+        means = moments.means
+        variances = jnp.diagonal(moments.covariances, axis1=-2, axis2=-1)
         for i, *_ in filter.limits:
             given_other_limits = filter.condition_on_limits(filter.hold(state), without=i)
             moments_before_own_limit = self._read_moments(filter.base, given_other_limits)
@@ -92,7 +98,8 @@ class MultistepPredictor(Module):
         """Return the moments of the states before they are conditioned on their limits, for a sampler that cuts draws.
 
         Only means beyond a limit are moved to it (`hold`), as in the filter's own correction. The weights of the K
-        Gaussians are those given that the limits hold: one that lies mostly beyond them is less probable.
+        Gaussians are those given that the limits hold: one that lies mostly beyond them is less probable. `state`: the
+        filter's state.
         """
         filter = self.filter
         if not isinstance(filter, LimitedFilter):
@@ -142,7 +149,8 @@ class MultistepPredictor(Module):
         filter, prior_within_limits = _condition_on_limits(self.filter, prior)
         if isinstance(filter, MultipleModelFilter) and memories((self.plant, self.sensor)):
             return _measure_in_each_mode(filter, prior_within_limits, k)
-        plant, initial_moments = at(self.plant, k), second_moments_at_start(self.plant)
+        # The models of step k; `under` gives the sensor for these inputs.
+        plant = at(self.plant, k)
         sensor = at(self.sensor, k).under(plant.inputs, u)
         # Of a start that is not known yet some outputs have infinite variances; sensors are linear there.
         if isinstance(prior, Diffuse):
@@ -153,29 +161,54 @@ class MultistepPredictor(Module):
         if isinstance(self.filter, AdaptiveFilter):
             deviations = jnp.asarray(self.filter.noise_deviations(prior, k))
             learned_noise = sensor.noise.columns.through(jnp.diag(deviations))
-
-        def predict_outputs(mean: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array]:
-            """Return mean and covariance of the outputs from those of the states, for one component of the mixture.
-
-            `learned_noise` is the sensor's noise as the filter has learned it, or None.
-            """
-            states_law = from_covariance(mean, covariance)
-            signal = find_signal_moments(plant, sensor, self.transform, states_law, initial_moments, learned_noise)
-            return signal.mean, signal.covariance
-
-        means, covariances = jax.vmap(predict_outputs)(states.means, states.covariances)
-        outputs = Moments(states.weights, means, covariances)
+        initial_power = second_moments_at_start(self.plant)
+        outputs = self._measure_each_component(plant, sensor, states, initial_power, learned_noise)
         laws = self._find_output_laws(states, outputs, sensor.noise, deviations)
         # Student's law of at most two degrees has no variance.
+        covariances = outputs.covariances
         if isinstance(sensor.noise, StudentT):
             has_no_variance = jnp.full(len(sensor.outputs), jnp.asarray(sensor.noise.degrees) <= 2)
             covariances = jax.vmap(lambda covariance: mark_unknown(covariance, has_no_variance))(covariances)
         return outputs._replace(covariances=covariances, laws=laws)
 
+    def _measure_each_component(
+        self,
+        plant: AbstractPlant,
+        sensor: AbstractSensor,
+        states: Moments,
+        initial_power: jax.Array,
+        learned_noise: WeightedColumns | None,
+    ) -> Moments:
+        """Return the moments of the sensor's outputs, for each of K Gaussians of the states, with the same weights.
+
+        Args:
+            plant: the plant at this step.
+            sensor: the sensor at this step.
+            states: moments of the states: means (K, n) and covariances (K, n, n).
+            initial_power: E[x_i^2] of each state before any data (n,), by which rounding is judged.
+            learned_noise: the sensor's noise as the filter has learned it; None for that of the sensor.
+        """
+
+        def predict_outputs(mean: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array]:
+            """Return mean and covariance of the outputs from those of the states, for one Gaussian.
+
+            The other arguments of `find_signal_moments`, such as `plant`, `sensor` and `learned_noise`, are those of
+            `_measure_each_component`.
+            """
+            states_law = from_covariance(mean, covariance)
+            signal = find_signal_moments(plant, sensor, self.transform, states_law, initial_power, learned_noise)
+            return signal.mean, signal.covariance
+
+        means, covariances = jax.vmap(predict_outputs)(states.means, states.covariances)
+        return Moments(states.weights, means, covariances)
+
     def _find_output_laws(
         self, states: Moments, outputs: Moments, noise: AbstractNoise, deviations: jax.Array | None
     ) -> MarginalLaws | None:
         """Return the law of each output if the sensor's noise is a mixture of Gaussians; None if it is Gaussian.
+
+        An output is what is measured without noise, with the variances of `outputs` less those of the noise, plus the
+        noise: a Gaussian for each pair of a Gaussian of the states and one of the noise ("branches").
 
         Args:
             states: moments of the states.
@@ -200,12 +233,18 @@ class MultistepPredictor(Module):
 
         The filter's innovation z - E[z] at z = 0 has the value -E[z] and the covariance of z. Noise with outliers is a
         mixture of Gaussians ("branches"), and so is then the law of each number of z (`laws`): a Gaussian with the
-        variance of z less that of the noise, plus this noise. `outputs`: moments of what the sensor would measure.
+        variance of z less that of the noise, plus this noise.
+
+        Args:
+            prior: the filter's state, predicted for step k.
+            outputs: moments of what the sensor would measure then, or None.
+            k: the step.
         """
         if not self.receives:
             return None
         innovation = _find_innovation_of_zero(self.filter, prior, k)
-        mean, covariance = -jnp.asarray(innovation.value), jnp.asarray(innovation.covariance)
+        mean = -jnp.asarray(innovation.value)
+        covariance = jnp.asarray(innovation.covariance)
         moments = Moments(weights=jnp.ones(1), means=mean[None], covariances=covariance[None])
         noise = self.received_noise
         if noise is None or outputs is None:
@@ -219,7 +258,11 @@ class MultistepPredictor(Module):
         return moments._replace(laws=laws)
 
     def predict_step(self, state: PyTree, u: jax.Array, k: jax.Array) -> tuple[PyTree, tuple[Moments | None, ...]]:
-        """Return the state predicted over step k, and the moments of states, outputs and received numbers there."""
+        """Return the filter's state predicted over step k, and the moments of the plant there.
+
+        The moments are those of the states, the sensor's outputs and the received numbers, in this order; the last two
+        are None where they are not predicted. `u`: inputs of the step (inputs,).
+        """
         prior = self.filter.predict(state, u, k)
         states = self.compute_state_moments(prior)
         outputs = self.predict_measured(prior, states, u, k)
@@ -234,14 +277,28 @@ def _condition_on_limits(filter: AbstractFilter, state: PyTree) -> tuple[Abstrac
 
 
 def _measure_in_each_mode(filter: MultipleModelFilter, prior: PyTree, k: jax.Array) -> Moments:
-    """Return the moments of the outputs at step k, a mixture with a Gaussian for each mode of the filter."""
+    """Return the moments of the outputs at step k, a mixture with a Gaussian for each mode of the filter.
+
+    Args:
+        filter: the filter, which weighs modes by their probability.
+        prior: the filter's state, predicted for step k.
+        k: the step.
+    """
     signal, weights = filter.prior_signals(prior, k)
     covariances = jax.vmap(lambda of_mode: of_mode.covariance)(signal)
     return Moments(weights=weights, means=signal.mean, covariances=covariances)
 
 
 def _measure_unknown_state(prior: Diffuse, sensor: LinearSensor) -> Moments:
-    """Return the moments of the outputs if part of the state is unknown; some variances are then infinite."""
+    """Return the moments of the outputs if part of the state is unknown; some variances are then infinite.
+
+    Before the first measurements nothing is known of some states; what a sensor would measure of these has an infinite
+    variance.
+
+    Args:
+        prior: the filter's predicted state, with a mean, a covariance and the directions that are unknown.
+        sensor: the sensor of the step.
+    """
     covariance, unknown = project_diffuse(prior, jnp.asarray(sensor.matrix))
     noise = jnp.asarray(sensor.noise.covariance)
     mean = jnp.asarray(sensor.matrix) @ prior.mean + jnp.asarray(sensor.noise.mean)
@@ -249,7 +306,16 @@ def _measure_unknown_state(prior: Diffuse, sensor: LinearSensor) -> Moments:
 
 
 def _find_innovation_of_zero(filter: AbstractFilter, prior: PyTree, k: jax.Array) -> Innovation:
-    """Return the innovation z - E[z] of z = 0, that is -E[z], with the covariance of z, for the predicted state."""
+    """Return the innovation z - E[z] of z = 0, that is -E[z], with the covariance of z, for the predicted state.
+
+    A filter has no function that predicts z, but its correction compares z with that prediction: by z = 0 it becomes
+    visible. Filters that are wrapped around another one are taken apart until one predicts z itself.
+
+    Args:
+        filter: the filter.
+        prior: its state, predicted for step k.
+        k: the step.
+    """
     filter, prior = _condition_on_limits(filter, prior)
     if isinstance(filter, FilterOfInputs):
         return _find_innovation_of_zero(filter.make_filter_under(prior.u, k), prior.base, k)
@@ -268,8 +334,9 @@ def make_multistep_predictor(
     """Return what predicts a filter's states, the sensor's outputs and the received numbers several steps ahead.
 
     It takes the plant and sensor for which the filter was made, or the arguments if the filter does not know them.
-    Received numbers are not predicted if the filter receives none, or if it also uses that nothing arrives. Nor are
-    they if z tells the mode: E[z] is found by a correction with zeros, which would stand for a mode.
+    Received numbers z are not predicted if the filter receives none, or if it also uses that nothing arrives (a sender
+    that decides when to send). Nor are they if z has the number of the channel's mode in it: E[z] is found by a
+    correction with z = 0, which would stand for a mode.
     """
     assumed = filter.assumed  # the models for which the filter was made
     plant = plant if assumed is None else assumed.plant
@@ -316,83 +383,3 @@ def _find_received_noise(filter: AbstractFilter) -> ReceivedNoise | OverTime | N
 def _compute_moments_now(predictor: MultistepPredictor, state: PyTree) -> Moments:
     """Return the moments of the plant's states in a filter's `state`, before they are conditioned on limits."""
     return predictor.compute_moments_before_limits(state)
-
-
-def predict_moments(
-    predictor: MultistepPredictor, state: PyTree, u: np.ndarray, step: int | np.ndarray
-) -> tuple[Moments | None, ...]:
-    """Return the moments of states, outputs and what arrives at each row ahead (rows, K, ...).
-
-    Native code computes them if it supports the filter. `state`: the filter's state at `step`. `u`: inputs
-    (rows, inputs).
-    """
-    arguments = predictor, state, np.asarray(u, dtype=float), np.asarray(step)
-    moments: tuple[Moments | None, ...] = compute_once(_predict_moments, _by_xla, arguments)
-    return moments
-
-
-def predict_moments_of_each(
-    predictor: MultistepPredictor, state: PyTree, u: np.ndarray, step: int | np.ndarray
-) -> tuple[Moments | None, ...]:
-    """Return the moments of several plants at each row ahead (plants, rows, K, ...), computed side by side.
-
-    state, u and step lead with an axis over the plants.
-    """
-    arguments = jax.tree.map(np.asarray, (state, np.asarray(u, dtype=float), step))
-    with jax.enable_x64(True):
-        choice = choose_code(_predict_moments, (predictor, *arguments), differs_by_run=[False, True, True, True])
-        if choice.code is not None:
-            found: tuple[Moments | None, ...] = choice.results()
-            return found
-        # By XLA in blocks of one size, the last filled up with its last plant.
-        count = len(u)
-        blocks = [
-            to_numpy(_each_by_xla(predictor, *jax.tree.map(lambda a, rows=rows: a[rows], arguments)))
-            for begin in range(0, count, BLOCK)
-            for rows in (np.minimum(np.arange(begin, begin + BLOCK), count - 1),)
-        ]
-    return jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *blocks)  # type: ignore[no-any-return]
-
-
-def _predict_moments(predictor: MultistepPredictor, state: PyTree, u: jax.Array, step: jax.Array) -> PyTree:
-    """Return the moments of states, outputs and what arrives at each step ahead (steps, K, ...).
-
-    They start from a state at `step`, under inputs `u` (steps, inputs).
-    """
-
-    def predict_row(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
-        """Return the state a row ahead, and the moments there."""
-        return predictor.predict_step(state, *row)
-
-    rows = jnp.asarray(u), jnp.asarray(step) + jnp.arange(len(u))
-    _, moments = jax.lax.scan(predict_row, jax.tree.map(jnp.asarray, state), rows)
-    return moments
-
-
-def _predict_moments_of_each(predictor: MultistepPredictor, states: PyTree, u: jax.Array, steps: jax.Array) -> PyTree:
-    """Return the moments of each step ahead for several plants, whose states, inputs and steps have a leading axis."""
-    return jax.vmap(lambda *plant: _predict_moments(predictor, *plant))(states, u, steps)
-
-
-_by_xla, _each_by_xla = quickly_compiled(_predict_moments), quickly_compiled(_predict_moments_of_each)
-
-
-def find_output_claim(filter: AbstractFilter, predictor: MultistepPredictor) -> Claim:
-    """Return the claim of predicted outputs: the filter's, or "nominal" for angles and nonlinear sensors."""
-    sensor = first(predictor.sensor)
-    is_exact = isinstance(sensor, LinearSensor) and not sensor.circular
-    return filter.claim if is_exact or filter.claim == "none" else weakest([filter.claim, "nominal"])
-
-
-def find_received_claim(filter: AbstractFilter) -> Claim:
-    """Return the claim of what is predicted to arrive: the filter's, or "nominal" if example numbers stand for unknown.
-
-    A `ToldFilter` receives numbers with each message that determine the link's law, such as a noise variance. They are
-    not known ahead. Unless their own law is known, an example of them is used, with which the covariance is nominal.
-    """
-    base = filter
-    while isinstance(base, LimitedFilter | FilterOfInputs):
-        base = base.base
-    if isinstance(base, ToldFilter) and not base.knows_law_of_numbers and filter.claim != "none":
-        return weakest([filter.claim, "nominal"])
-    return filter.claim

@@ -97,7 +97,10 @@ def _make_forecast(predictor: MultistepPredictor, z: np.ndarray, u: np.ndarray, 
         names: names of the numbers that arrive.
     """
     rows = np.arange(len(z)), z, u
-    _, moments = scan_rows(_begin, _predict_and_correct, predictor, rows, lambda: _by_xla(predictor, rows))
+    # Native code steps over the rows if it supports the filter, else JAX's compiler XLA.
+    _, moments = scan_rows(
+        begin=_begin, step=_predict_and_correct, fixed=predictor, rows=rows, by_xla=lambda: _by_xla(predictor, rows)
+    )
     return combine_predictions(
         predictor,
         moments,
@@ -116,7 +119,13 @@ def _begin(predictor: MultistepPredictor) -> PyTree:
 def _predict_and_correct(
     predictor: MultistepPredictor, state: PyTree, row: tuple[jax.Array, ...]
 ) -> tuple[PyTree, PyTree]:
-    """Return the state after a row, and the moments (K, ...) that were predicted for it from the earlier rows."""
+    """Return the filter's state after a row, and the moments (K, ...) predicted for the row from the earlier ones.
+
+    Args:
+        predictor: predicts the filter's state, and reads the moments of states, outputs and received numbers from it.
+        state: the filter's state before the row.
+        row: number k of the row, measurements z (received,) and inputs u (inputs,).
+    """
     k, z, u = row
     prior, moments = predictor.predict_step(state, u, k)
     state_after, _ = predictor.filter.correct(prior, z, k)
@@ -124,7 +133,10 @@ def _predict_and_correct(
 
 
 def _predict_each_row(predictor: MultistepPredictor, rows: PyTree) -> tuple[PyTree, PyTree]:
-    """Return the last state, and the moments (rows, K, ...) that a filter predicts for each row of a recording."""
+    """Return the last state, and the moments (rows, K, ...) that a filter predicts for each row of a recording.
+
+    `rows`: numbers of the rows, measurements and inputs. XLA compiles this where native code does not support a filter.
+    """
     return jax.lax.scan(partial(_predict_and_correct, predictor), _begin(predictor), rows)
 
 

@@ -11,7 +11,10 @@ from heliograph.numerics.module import Module
 
 
 class StateLimits(Module):
-    """Limits within which states of a path keep: index, lowest and highest value of each limited one."""
+    """Limits within which states of a path keep, such as a level that is not negative.
+
+    `limits` has a tuple for each limited state: its index, lowest and highest value.
+    """
 
     limits: PlacedLimits = eqx.field(static=True)
 
@@ -33,18 +36,39 @@ class StateLimits(Module):
         return x
 
 
+def _draw_normal_within(
+    low: np.ndarray, high: np.ndarray, generator: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Draw standard normal numbers given that they lie within limits; return them and the probability of that (draws,).
+
+    They are values of the inverse distribution function, drawn uniformly between its values at the limits.
+
+    Args:
+        low: lower limits, in deviations from the mean (draws,); minus infinity where there is none.
+        high: upper limits, likewise.
+        generator: of the random numbers.
+    """
+    probability_below_low, probability_below_high = ndtr(low), ndtr(high)
+    probability_within = probability_below_high - probability_below_low
+    return ndtri(probability_below_low + generator.random(len(low)) * probability_within), probability_within
+
+
 def draw_limited_components(
     part: np.ndarray, means: np.ndarray, covariances: np.ndarray, limits: PlacedLimits, generator: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return means (draws, n) and covariances (K, n, n) of Gaussians given their limited components, which are drawn.
+    """Draw the limited states of a Gaussian mixture within their limits; return the law of all states given these.
 
-    Some states have limits (such as a level that is not negative), so that draws of a Gaussian mixture must respect
-    them. The limited components are drawn one after the other, each from its normal law given those before, cut to its
-    limits. If several are limited, this sequence alone favours some draws: each draw gets as weight the product of the
-    probabilities of being within the limits, and draws are drawn anew by weight.
+    A limited state is one such as a level that is not negative. These states are drawn one after the other, each from
+    its normal law given those before, cut to its limits. If several are limited, this sequence alone favours some
+    draws: each draw gets as weight the product of its probabilities of being within the limits, and the draws of each
+    Gaussian are drawn anew by weight.
+
+    Returns:
+        For each draw the mean of all states given the drawn ones (draws, n), in which the drawn ones are themselves;
+        and for each Gaussian the covariance given them (K, n, n), which does not depend on their values.
 
     Args:
-        part: index of the Gaussian of each draw (draws,).
+        part: part[d] is the index of the Gaussian from which draw d comes (draws,).
         means: means of the Gaussians (K, n).
         covariances: covariances of the Gaussians (K, n, n).
         limits: index, lowest and highest value of each limited component.
@@ -53,31 +77,30 @@ def draw_limited_components(
     Source: the simulator of Geweke, Hajivassiliou and Keane; Genz and Bretz, Computation of multivariate normal and t
         probabilities (2009), 4.2.
     """
-    # `center` (draws, n) and `left` (K, n, n): mean and covariance given the components drawn so far.
-    center, left, weight = means[part], covariances, np.ones(len(part))
+    # Mean (draws, n) and covariance P (K, n, n) given the components drawn so far.
+    mean, P = means[part], covariances
+    weight = np.ones(len(part))
     for i, low, high in limits:
-        # Draw the component by the inverse of its distribution function, between that function's values at the limits.
-        # A component without variance stays.
-        variance = left[:, i, i]
+        # Draw the component within its limits. One without variance stays.
+        variance = P[:, i, i]
         is_random = variance > 0
         divisor = np.where(is_random, variance, 1.0)
         deviation = np.sqrt(divisor)[part]
-        least, most = (ndtr((end - center[:, i]) / deviation) for end in (low, high))
-        units = ndtri(least + generator.random(len(part)) * (most - least))
-        moved = np.where(is_random[part], deviation * units, 0.0)
-        drawn = np.clip(center[:, i] + moved, low, high)
-        # The probability of being within the limits.
-        weight *= np.where(is_random[part], most - least, 1.0)
-        # Condition the others: center + slope (drawn - mean), P - P_j P_j' / P_jj, with P_j the column of this
-        # component.
-        slopes = np.where(is_random[:, None], left[:, :, i] / divisor[:, None], 0.0)
-        center = center + slopes[part] * (drawn - center[:, i])[:, None]
-        center[:, i] = drawn
-        left = left - slopes[:, :, None] * left[:, None, i]
+        low_end, high_end = ((end - mean[:, i]) / deviation for end in (low, high))
+        normal, probability_within = _draw_normal_within(low_end, high_end, generator)
+        moved = np.where(is_random[part], deviation * normal, 0.0)
+        drawn = np.clip(mean[:, i] + moved, low, high)
+        weight *= np.where(is_random[part], probability_within, 1.0)
+        # Condition all components on this one: mean + slope (drawn - mean_i), P - P_i P_i' / P_ii, with P_i its column
+        # of P and slope = P_i / P_ii.
+        slopes = np.where(is_random[:, None], P[:, :, i] / divisor[:, None], 0.0)
+        mean = mean + slopes[part] * (drawn - mean[:, i])[:, None]
+        mean[:, i] = drawn
+        P = P - slopes[:, :, None] * P[:, None, i]
     # Resample the draws of each Gaussian by weight.
     if len(limits) > 1 and np.ptp(weight) > 0:
         for number in np.unique(part):
-            own = np.flatnonzero(part == number)
+            own = np.flatnonzero(part == number)  # the draws of this Gaussian
             share = weight[own] / weight[own].sum() if weight[own].any() else None
-            center[own] = center[generator.choice(own, size=len(own), p=share)]
-    return center, left
+            mean[own] = mean[generator.choice(own, size=len(own), p=share)]
+    return mean, P

@@ -11,8 +11,8 @@ from heliograph.disk.colours_of_figures import COLOURS
 if TYPE_CHECKING:  # it takes a second
     from matplotlib.figure import Figure
 
-OUTSIDE = 0.025  # probability beyond each side of a band
-MOST = 20  # outputs of a figure
+PROBABILITY_OUTSIDE = 0.025  # probability beyond each side of a band
+MOST_OUTPUTS = 20  # outputs of a figure
 WIDTH, HEIGHT_OF_TITLES, HEIGHT_OF_ROW = 9.0, 0.5, 1.9  # inches
 TWO_DEVIATIONS = 2  # about which 95 % of normal residuals lie
 
@@ -36,13 +36,13 @@ class ResidualQuantiles(NamedTuple):
 def compare_with_normal_quantiles(e: np.ndarray) -> ResidualQuantiles:
     """Return residuals (steps,) without NaN in order, beside normal quantiles, with a band for each.
 
-    The normal probability of the i-th of n residuals has the law Beta(i, n + 1 - i). The band leaves OUTSIDE beyond
-    each side.
+    The normal probability of the i-th of n residuals has the law Beta(i, n + 1 - i). The band leaves
+    PROBABILITY_OUTSIDE beyond each side.
     """
     sorted_residuals = np.sort(e[~np.isnan(e)])
     n = len(sorted_residuals)
     i = np.arange(1, n + 1)
-    low, high = (np.asarray(ndtri(beta.ppf(p, i, n + 1 - i))) for p in (OUTSIDE, 1 - OUTSIDE))
+    low, high = (np.asarray(ndtri(beta.ppf(p, i, n + 1 - i))) for p in (PROBABILITY_OUTSIDE, 1 - PROBABILITY_OUTSIDE))
     return ResidualQuantiles(normal=ndtri(i / (n + 1)), residuals=sorted_residuals, low=low, high=high)
 
 
@@ -63,7 +63,7 @@ def draw_residuals(
     """
     from matplotlib.figure import Figure
 
-    count = min(len(names), MOST)
+    count = min(len(names), MOST_OUTPUTS)
     figure = Figure(figsize=(WIDTH, HEIGHT_OF_TITLES + HEIGHT_OF_ROW * count), layout="constrained")
     grid = figure.subplots(count, 3, squeeze=False, width_ratios=[2, 1, 1])
     lags = np.arange(1, len(autocorrelation) + 1)

@@ -24,10 +24,10 @@ from heliograph.simulation.results.record import Record
 if TYPE_CHECKING:  # it takes a second
     from matplotlib.figure import Figure
 
-FALSE = 0.01  # probability of any false doubt, of all tests together
-LEAST = 20  # residuals for tests
+FALSE_DOUBT = 0.01  # probability of any false doubt, of all tests together
+FEWEST_RESIDUALS = 20  # residuals for tests
 LAGS = 10  # of autocorrelations
-NORMAL = 1.959963984540054  # quantile of an interval of 95 %
+NORMAL_QUANTILE = 1.959963984540054  # quantile of an interval of 95 %
 
 
 @readable
@@ -60,7 +60,8 @@ class Residuals:
     def doubts(self) -> list[str]:
         """List what speaks against the model, one line each.
 
-        A p-value does if it is below FALSE divided by the number of tests. FALSE: the probability of any wrong doubt.
+        A p-value does if it is below FALSE_DOUBT (0.01) divided by the number of tests (Bonferroni): if the model is
+        right, the probability of any doubt at all is then at most FALSE_DOUBT.
         """
         tests = {"correlated over time": self.ljung_box, "not normal": self.normality,
                  "of a variance that changes": self.variance}  # fmt: skip
@@ -69,7 +70,7 @@ class Residuals:
             f"residuals of {name} are {finding} (p = {p[i]:.1g} of {count} tests)"
             for i, name in enumerate(self.names)
             for finding, p in tests.items()
-            if p[i] < FALSE / count
+            if p[i] < FALSE_DOUBT / count
         ]
 
     def quantiles(self, name: str) -> ResidualQuantiles:
@@ -123,7 +124,8 @@ def residuals(
     instance("filter", filter, AbstractFilter, "a filter, such as kalman_filter(...)")
     # Predict each row from those before it, then standardise and test; angles are compared within a turn.
     rows, inputs = check_data(filter, z, u)
-    predicted, count = predict_rows(filter, rows, inputs), check_count("lags", lags)
+    predicted = predict_rows(filter, rows, inputs)
+    count = check_count("lags", lags)
     angles = (filter.angles_used() or FilterAngles((), ())).received
     found = _standardise(predicted, np.asarray(rows), angles, count)
     if found is None:
@@ -187,7 +189,7 @@ def _standardise(predicted: Forecast, rows: np.ndarray, angles: Angles, lags: in
         values=values,
         predicted=predicted,
         autocorrelation=np.stack(correlations, axis=1),
-        band=NORMAL * np.array(errors),
+        band=NORMAL_QUANTILE * np.array(errors),
         ljung_box=np.array([_test_correlation(e, lags) for e in by_number]),
         normality=np.array([_test_normality(e) for e in by_number]),
         variance=np.array([_test_same_variance(e) for e in by_number]),
@@ -195,7 +197,12 @@ def _standardise(predicted: Forecast, rows: np.ndarray, angles: Angles, lags: in
 
 
 def _multiply_pairs(e: np.ndarray, lag: int) -> np.ndarray:
-    """Return the products e_t e_(t+lag) of residuals (steps,) of which both came."""
+    """Return the products e_t e_(t+lag) of residuals (steps,) of which both came.
+
+    Args:
+        e: residuals (steps,), NaN where nothing arrived.
+        lag: distance of the rows that are multiplied.
+    """
     products = e[lag:] * e[: len(e) - lag]
     return np.asarray(products[~np.isnan(products)])
 
@@ -209,10 +216,14 @@ def _test_correlation(e: np.ndarray, lags: int) -> float:
     """Return the p-value of n (n + 2) sum_l r_l^2 / n_l, which is chi-squared if all correlations r_l are zero.
 
     r_l = sum e_t e_(t+l) / sum e_t^2 over what came: n residuals, and n_l pairs of lag l. The result is NaN for n below
-    LEAST.
+    FEWEST_RESIDUALS.
+
+    Args:
+        e: residuals (steps,), NaN where nothing arrived.
+        lags: number of lags l.
     """
     n = int(np.sum(~np.isnan(e)))
-    if n < LEAST:
+    if n < FEWEST_RESIDUALS:
         return float("nan")
     e = _subtract_mean(e)
     pairs = [_multiply_pairs(e, lag) for lag in range(1, lags + 1)]
@@ -225,14 +236,15 @@ def _test_normality(e: np.ndarray) -> float:
     """Return the p-value of n (S^2 + (K - 3)^2 / 4) / 6, with S the skewness and K the kurtosis of residuals.
 
     The number is chi-squared with 2 degrees of freedom if the n residuals that are not NaN are normal. The result is
-    NaN for n below LEAST.
+    NaN for n below FEWEST_RESIDUALS. `e`: residuals (steps,), NaN where nothing arrived.
     """
     e = e[~np.isnan(e)]
     n = len(e)
-    if n < LEAST:
+    if n < FEWEST_RESIDUALS:
         return float("nan")
     standardised = (e - e.mean()) / e.std()
-    S, K = np.mean(standardised**3), np.mean(standardised**4)
+    S = np.mean(standardised**3)
+    K = np.mean(standardised**4)
     return float(chi2.sf(n * (S**2 + (K - 3) ** 2 / 4) / 6, df=2))
 
 
@@ -240,11 +252,12 @@ def _test_same_variance(e: np.ndarray) -> float:
     """Return the two-sided p-value of the ratio of the sums of squares in the last and the first third of residuals.
 
     With h residuals (not NaN) in a third, the ratio has the F law with h and h degrees of freedom if the variance is
-    the same. The result is NaN for h below half of LEAST.
+    the same. The result is NaN for h below half of FEWEST_RESIDUALS. `e`: residuals (steps,), NaN where nothing
+    arrived.
     """
     e = e[~np.isnan(e)]
     h = len(e) // 3
-    if h < LEAST // 2:
+    if h < FEWEST_RESIDUALS // 2:
         return float("nan")
     ratio = float(np.sum(e[-h:] ** 2) / np.sum(e[:h] ** 2))
     return float(2 * min(f.sf(ratio, h, h), f.cdf(ratio, h, h)))

@@ -16,17 +16,32 @@ from heliograph.numerics.types import PyTree
 def roll_forecasts(
     predictor: MultistepPredictor, z: np.ndarray, u: np.ndarray, horizons: Sequence[int]
 ) -> tuple[Moments, Moments | None]:
-    """Return forecasts from each row at each horizon: of the states, and of what would arrive.
+    """Return the forecasts from each row of a recording at each horizon: of the states, and of the received numbers.
 
-    Their moments (rows, horizons, K, ...) have variances instead of covariances. Inputs ahead are those of the later
-    rows; after the last row its inputs stay.
+    A filter runs over the rows; behind each it predicts as if nothing more arrived, under the inputs of the later rows.
+    After the last row its inputs are repeated. Received numbers are None if the filter does not predict them.
+
+    Args:
+        predictor: predicts the filter's state without data, and reads moments from it.
+        z: measurements (rows, received), NaN where nothing arrived.
+        u: inputs (rows, inputs).
+        horizons: rows ahead, in rising order.
+
+    Returns:
+        Moments of mixtures of K Gaussians: weights (rows, horizons, K) and means (rows, horizons, K, size). The field
+        `covariances` holds the variances alone (rows, horizons, K, size).
     """
     longest = horizons[-1]
     padded = np.concatenate([u, np.repeat(u[-1:], longest, axis=0)])
-    # For each row, the inputs of the rows after it: (rows, longest, inputs).
+    # windows[k, i] are the inputs of row k + 1 + i: (rows, longest, inputs).
     windows = np.stack([padded[1 + i : 1 + i + len(u)] for i in range(longest)], axis=1)
-    arguments = predictor, z, u, windows, np.asarray(horizons) - 1
-    rolled: tuple[Moments, Moments | None] = compute_once(_forecast_from_each_row, _by_xla, arguments)
+    indices = np.asarray(horizons) - 1  # among the rows ahead; horizon 1 is the first of them
+    arguments = predictor, z, u, windows, indices
+    # Native code computes `_forecast_from_each_row` if it supports the filter's operations; else JAX's compiler XLA
+    # does.
+    rolled: tuple[Moments, Moments | None] = compute_once(
+        function=_forecast_from_each_row, by_xla=_by_xla, arguments=arguments
+    )
     return rolled
 
 
@@ -57,7 +72,8 @@ def _forecast_from_each_row(
     def filter_and_forecast(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, PyTree]:
         """Return the filter's state after row k, and the moments that it forecasts from there.
 
-        The row holds k, the measurements, the inputs, and `window`, the inputs of the `length` rows ahead.
+        The row holds k, the measurements, the inputs, and `window`, the inputs of the `length` rows ahead. `predictor`
+        steps the filter without data; `select` takes the horizons from the moments of all rows ahead.
         """
         k, z_k, u_k, window = row
         after, _ = filter.correct(filter.predict(state, u_k, k), z_k, k)
@@ -68,7 +84,8 @@ def _forecast_from_each_row(
 
     start = jax.tree.map(jnp.asarray, filter.init())
     rows = jnp.arange(len(z)), jnp.asarray(z), jnp.asarray(u), jnp.asarray(windows)
-    return jax.lax.scan(filter_and_forecast, start, rows)[1]
+    _, forecasts = jax.lax.scan(filter_and_forecast, start, rows)
+    return forecasts
 
 
 _by_xla = quickly_compiled(_forecast_from_each_row)

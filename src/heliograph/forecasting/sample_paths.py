@@ -17,7 +17,7 @@ from heliograph.model.forecast_origin import HasOrigin
 from heliograph.model.markov_jump_models import ModalPlant, ModalSensor, transition_over
 from heliograph.model.over_time import at, first
 from heliograph.model.plant import AnyPlant
-from heliograph.model.sensor import AnySensor
+from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.numerics.angles.angle import wrap_angles
 from heliograph.numerics.angles.manifold import Manifold
 from heliograph.numerics.check import check_count, check_seed, fail, scalar
@@ -113,15 +113,16 @@ def draw_paths(
     plant, sensor = target.predictor.plant, target.predictor.sensor
     if plant is None:
         raise fail("paths", "a filter that says what its plant is", type(target.predictor.filter).__name__)
-    count, key = check_count("draws", draws), jax.random.key(check_seed("seed", seed))
+    count = check_count("draws", draws)
+    key = jax.random.key(check_seed("seed", seed))
     # States and modes at the start, then states x and outputs y in all rows ahead, of which the horizons are kept.
     starts = _draw_initial_states(target, count, np.random.default_rng(seed))
     keys, step = jax.random.split(key, count), np.asarray(origin.step)
-    believer = target.predictor.filter
-    learned = None
-    if isinstance(believer, AdaptiveFilter):
-        learned = np.asarray(believer.noise_deviations(target.state, origin.step))
-    limits, switching = StateLimits(target.predictor.limits), _find_switching(target)
+    learned = None  # deviations of the sensor's noise where the filter learns them
+    if isinstance(adaptive := target.predictor.filter, AdaptiveFilter):
+        learned = np.asarray(adaptive.noise_deviations(target.state, origin.step))
+    limits = StateLimits(target.predictor.limits)
+    switching = _find_switching(target)
     x, y = _draw_paths_from_states(plant, sensor, starts, ahead.u, keys, step, switching, learned, limits)
     return Paths(
         steps=ahead.steps,
@@ -133,8 +134,20 @@ def draw_paths(
     )
 
 
+class PathState(NamedTuple):
+    """Where a path is after a step: its state x, and its mode, 0 if plant and sensor have none; or of many paths."""
+
+    x: Any
+    mode: Any
+
+
 class ModeSwitching(NamedTuple):
-    """How a path's mode moves: by the filter's chain, from the first step on if the chain has `moved` before."""
+    """How a path's mode moves: by the Markov chain of the filter's modes.
+
+    Args:
+        filter: the filter, which has the chain; each of its joint modes is one of plant, sensor and channel together.
+        moved: whether the filter has predicted before. If not, its modes are already those of the first step.
+    """
 
     filter: MultipleModelFilter
     moved: Bool[Array, ""]
@@ -142,20 +155,31 @@ class ModeSwitching(NamedTuple):
     def draw_next(self, key: jax.Array, mode: jax.Array, u: jax.Array, k: jax.Array, is_first: jax.Array) -> jax.Array:
         """Return the mode of step k, drawn by the chain from the mode of the previous step.
 
-        `self.moved`: True if the filter has predicted before. If not, its modes are already those of the first step,
-        where the mode stays as it is. `u`: inputs of the step.
+        Args:
+            key: of the random numbers.
+            mode: joint mode of the previous step.
+            u: inputs of the step (inputs,), on which the transition probabilities may depend.
+            k: number of the step.
+            is_first: whether it is the path's first step. The mode stays there if the filter has not predicted before.
         """
         plant, channel = at(self.filter.plant, k), at(self.filter.channel, k)
-        rows = transition_over(plant, u, jnp.asarray(channel.transition))
+        transition = transition_over(plant, u, jnp.asarray(channel.transition))  # row i: probabilities of the next mode
         stays = is_first & ~jnp.asarray(self.moved)
-        return jnp.where(stays, mode, jax.random.categorical(key, jnp.log(rows[mode])))
+        return jnp.where(stays, mode, jax.random.categorical(key, jnp.log(transition[mode])))
 
     def choose_models(self, plant: Any, sensor: Any, mode: jax.Array) -> tuple[Any, Any]:
-        """Return plant and sensor of one step as they are in a joint mode."""
-        plant_mode, sensor_mode = (
-            jnp.asarray(self.filter.plant_modes)[mode],
-            jnp.asarray(self.filter.sensor_modes)[mode],
-        )
+        """Return plant and sensor of one step as they are in a joint mode; a part without modes as it is.
+
+        A joint mode is a mode of the plant, one of the sensor and one of the channel together; the filter has a table
+        of each part's mode by joint mode.
+
+        Args:
+            plant: the plant of the step.
+            sensor: the sensor of the step, or None.
+            mode: number of the joint mode.
+        """
+        plant_mode = jnp.asarray(self.filter.plant_modes)[mode]
+        sensor_mode = jnp.asarray(self.filter.sensor_modes)[mode]
         if isinstance(plant, ModalPlant):
             plant = plant.given(plant_mode)
         if isinstance(sensor, ModalSensor):
@@ -164,8 +188,14 @@ class ModeSwitching(NamedTuple):
 
 
 def _find_switching(target: ForecastTarget) -> ModeSwitching | None:
-    """Return how the modes of plant and sensor move, or None if these have no modes."""
-    filter, plant, sensor = target.predictor.filter, target.predictor.plant, target.predictor.sensor
+    """Return how the modes of plant and sensor move, or None if these have no modes.
+
+    Paths draw the present mode from the filter's probabilities of the modes, so only a filter that has them will do.
+    `target` is the filter, with its plant, sensor and last state.
+    """
+    filter = target.predictor.filter
+    plant = target.predictor.plant
+    sensor = target.predictor.sensor
     if not memories((plant, sensor)):
         return None
     if isinstance(filter, LimitedFilter):
@@ -176,13 +206,16 @@ def _find_switching(target: ForecastTarget) -> ModeSwitching | None:
     return ModeSwitching(filter, target.state.moved)
 
 
-def _draw_initial_states(
-    target: ForecastTarget, draws: int, generator: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return states (draws, n) and modes (draws,) drawn from the last estimate, a mixture of Gaussians.
+def _draw_initial_states(target: ForecastTarget, draws: int, generator: np.random.Generator) -> PathState:
+    """Return states (draws, n) and modes (draws,) drawn from the last estimate, a mixture of K Gaussians.
 
-    Each is drawn from a part that is drawn by its weight. The modes are 0 where the filter has none. `target` has the
-    filter (`predictor`) and its last state.
+    For each draw one Gaussian is drawn by its weight, and from it the mode and the state. The modes are 0 where the
+    filter has none.
+
+    Args:
+        target: the filter (`predictor`) and its last state.
+        draws: number of draws.
+        generator: of the random numbers.
 
     Raises:
         ValueError: a filter that claims no covariance, a state of which not all is known.
@@ -197,24 +230,24 @@ def _draw_initial_states(
     # A mode by its probability in the drawn part: the first whose cumulated probability is above a uniform number.
     modes: np.ndarray = np.zeros(draws, dtype=int)
     if isinstance(target.state, ModalBeliefs):
-        cumulated = np.cumsum(np.asarray(target.state.weight), axis=1)[part]
+        cumulated = np.cumsum(np.asarray(target.state.weight), axis=1)[part]  # weight: (K, modes)
         uniform = generator.random(draws)[:, None] * cumulated[:, -1:]  # weights of a part need not sum to 1
         modes = np.minimum((uniform > cumulated).sum(axis=1), cumulated.shape[1] - 1)
     # States with limits first, then the others given these: the part's mean, plus a root of its covariance times
     # standard normal numbers. Attitudes are turned.
-    center, covariances = draw_limited_components(part, means, covariances, target.predictor.limits, generator)
+    mean, covariances = draw_limited_components(part, means, covariances, target.predictor.limits, generator)
     values, vectors = np.linalg.eigh(covariances)
     roots = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
     changes = np.einsum("dij,dj->di", roots[part], generator.normal(size=(draws, means.shape[1])))
-    drawn: np.ndarray = Manifold((), filter.attitude).settle(center, center + changes)
-    return drawn, modes
+    drawn: np.ndarray = Manifold((), filter.attitude).settle(mean, mean + changes)
+    return PathState(x=drawn, mode=modes)
 
 
 @compile_in_float64
 def _draw_paths_from_states(
     plant: AnyPlant,
     sensor: AnySensor | None,
-    starts: tuple[Array, Array],
+    starts: PathState,
     u: Array,
     keys: jax.Array,
     step: Array,
@@ -227,7 +260,7 @@ def _draw_paths_from_states(
     Args:
         plant: of the paths.
         sensor: what measures them; None for none.
-        starts: state (draws, n) and mode (draws,) before the first row.
+        starts: states (draws, n) and modes (draws,) before the first row.
         u: inputs (rows, inputs).
         keys: a random key for each path (draws,).
         step: number of the first row.
@@ -237,31 +270,35 @@ def _draw_paths_from_states(
     """
 
     def draw_row(
-        before: tuple[jax.Array, jax.Array], row: tuple[jax.Array, jax.Array], key: jax.Array
-    ) -> tuple[Any, Any]:
-        """Draw row k of a path; return state and mode there, which the next row begins with, and state and output.
+        before: PathState, row: tuple[jax.Array, jax.Array], key: jax.Array
+    ) -> tuple[PathState, tuple[jax.Array, jax.Array]]:
+        """Draw row k of a path: return where the path is then, which the next row begins with, and state and output.
 
-        `plant` and `sensor` are the models of all rows, `switching` is how their modes move, `step` the number of the
-        first row.
+        `row` holds the inputs and the number k. The state moves by the plant, then noise is added; limits of states
+        hold after both. From outside: `plant` and `sensor` are the models of all rows, `switching` says how their modes
+        move, `step` is the number of the first row, `limits` are those of the states, and `learned` are deviations of
+        the noise that a filter learned.
         """
         (x, mode), (u_k, k) = before, row
         key_of_row = jax.random.fold_in(key, k)
         key_of_plant, key_of_sensor = jax.random.split(key_of_row)
-        plant_k, sensor_k = at(plant, k), None if sensor is None else at(sensor, k)
+        plant_k = at(plant, k)
+        sensor_k = None if sensor is None else at(sensor, k)
         if switching is not None:
             key_of_mode = jax.random.fold_in(key_of_row, 2)  # 0 and 1 may be the keys of plant and sensor
             mode = switching.draw_next(key_of_mode, mode, u_k, k, is_first=k == jnp.asarray(step))
             plant_k, sensor_k = switching.choose_models(plant_k, sensor_k, mode)
         moved = limits.hold(plant_k.transition(x, u_k))
         x = limits.hold(limits.mirror(plant_k.plus(moved, plant_k.sample_noise(key_of_plant, u_k))))
-        if sensor_k is None:
-            return (x, mode), (x, jnp.zeros(0))
-        return (x, mode), (x, _draw_outputs(sensor_k.under(plant_k.inputs, u_k), x, key_of_sensor, learned))
+        y = jnp.zeros(0)
+        if sensor_k is not None:
+            y = _draw_outputs(sensor_k.under(plant_k.inputs, u_k), x, key_of_sensor, learned)
+        return PathState(x, mode), (x, y)
 
-    def draw_path(start: tuple[jax.Array, jax.Array], key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return the states (rows, n) and outputs (rows, m) of one path, drawn row by row from a state and a mode.
+    def draw_path(start: PathState, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return the states (rows, n) and outputs (rows, m) of one path, drawn row by row from its start.
 
-        From outside: `u`, inputs of the rows, and `step`, number of the first row.
+        From outside: `u` are the inputs of the rows, `step` is the number of the first row, and `draw_row` draws a row.
         """
         rows = jnp.asarray(u), jnp.asarray(step) + jnp.arange(len(u))
         path: tuple[jax.Array, jax.Array]
@@ -272,13 +309,16 @@ def _draw_paths_from_states(
     return paths
 
 
-def _draw_outputs(sensor: Any, x: jax.Array, key: jax.Array, learned: Array | None) -> jax.Array:
+def _draw_outputs(sensor: AbstractSensor, x: jax.Array, key: jax.Array, learned: Array | None) -> jax.Array:
     """Return what a sensor measures (m,) of a state x, with noise drawn from its law.
 
-    `learned`: factors (m,) of the noise's deviations, if a filter learned them; else None.
+    Args:
+        sensor: the sensor of the step.
+        x: the state (n,).
+        key: of the random numbers.
+        learned: factors (m,) of the noise's deviations, if a filter learned them; else None.
     """
     law, noise = sensor.noise, sensor.noise.sample(key)
     if learned is not None:
-        noise = law.mean + jnp.asarray(learned) * (noise - law.mean)
-    y: jax.Array = wrap_angles(sensor.measure(x) + noise, sensor.angles)
-    return y
+        noise = jnp.asarray(law.mean + jnp.asarray(learned) * (noise - law.mean))
+    return jnp.asarray(wrap_angles(sensor.measure(x) + noise, sensor.angles))

@@ -27,26 +27,36 @@ class MixtureLaws(NamedTuple):
 
 
 def select_law(moments: Moments, number: int, horizon: int) -> MixtureLaws:
-    """Return the law of one number at one horizon (its index), from each row."""
+    """Return the forecast of one of m numbers at one horizon from each row, as a mixture of K Gaussians (rows, K).
+
+    Args:
+        moments: forecasts of all numbers from each row: weights (rows, horizons, K) and means (rows, horizons, K, m).
+            `covariances` holds only the variances, as `roll_forecasts` returns them: (rows, horizons, K, m). `laws`
+            has the laws of the single numbers where they are not this mixture, each part (rows, horizons, K, m).
+        number: index of the number.
+        horizon: index of the horizon.
+    """
     if moments.laws is not None:
         weights, means, variances = map(np.asarray, moments.laws)
-        of_number = (slice(None), horizon, slice(None), number)
-        return MixtureLaws(weights[of_number], means[of_number], variances[of_number])
-    weights, means = np.asarray(moments.weights), np.asarray(moments.means)
-    variances = np.asarray(moments.covariances)  # the field holds variances here, in place of covariances
+        return MixtureLaws(*(part[:, horizon, :, number] for part in (weights, means, variances)))
+    weights, means, variances = map(np.asarray, (moments.weights, moments.means, moments.covariances))
     return MixtureLaws(weights[:, horizon], means[:, horizon, :, number], variances[:, horizon, :, number])
 
 
 def compute_probability_below(law: MixtureLaws, values: np.ndarray) -> np.ndarray:
-    """Return P(less than what came) of each row (rows,): uniform on (0, 1) where the laws are right.
+    """Return P(X < value) of each row (rows,), X being of the row's law: uniform on (0, 1) where the laws are right.
 
     Of a value that a part knows exactly (variance 0) it is P(less) + P(equal) / 2: 1/2 where that is what came.
+
+    Args:
+        law: each row's forecast, a mixture of Gaussians.
+        values: what came (rows,), NaN where nothing did.
     """
     return np.asarray(np.sum(law.weights * ndtr(_standardise(values[:, None] - law.means, law.variances)), axis=1))
 
 
 def _standardise(difference: np.ndarray, variance: np.ndarray) -> np.ndarray:
-    """Return the difference in deviations; where the variance is 0, none is 0 and any other is infinite."""
+    """Return difference / sqrt(variance); where the variance is 0, a difference of 0 is 0 and any other is infinite."""
     deviation = np.sqrt(variance)
     is_known = deviation == 0
     in_deviations = difference / np.where(is_known, 1.0, deviation)
@@ -58,7 +68,11 @@ def _standardise(difference: np.ndarray, variance: np.ndarray) -> np.ndarray:
 def is_known_and_came(law: MixtureLaws, values: np.ndarray) -> np.ndarray:
     """Return in which rows the law knows the value, but for rounding, and it came (rows,).
 
-    An interval about it holds all of what comes, however small the share that it claims.
+    Any interval about such a forecast holds what comes, whatever share it claims, so it tests no coverage.
+
+    Args:
+        law: each row's forecast.
+        values: what came (rows,).
     """
     rounding = ROUNDING * np.abs(law.mean)
     is_known = (np.sqrt(law.variances) <= rounding[:, None]).all(axis=1)
@@ -70,10 +84,15 @@ def log_score(law: MixtureLaws, values: np.ndarray) -> np.ndarray:
 
     The largest term is taken out of the sum, so that not every exponential is 0. Of what is known exactly (variance 0)
     the density is infinite where it came, and 0 elsewhere. LOG_TURN: log(2 pi).
+
+    Args:
+        law: each row's forecast, a mixture of Gaussians.
+        values: what came (rows,), NaN where nothing did.
     """
     squares = _standardise(values[:, None] - law.means, law.variances) ** 2
     with np.errstate(divide="ignore"):  # a part may have weight 0, or variance 0
-        log_weights, log_variances = np.log(law.weights), np.log(law.variances)
+        log_weights = np.log(law.weights)
+        log_variances = np.log(law.variances)
     # An infinite square is no density, however small the variance.
     log_terms = log_weights - (squares + np.where(np.isinf(squares), 0.0, log_variances) + LOG_TURN) / 2
     largest = log_terms.max(axis=1)
@@ -88,6 +107,10 @@ def crps(law: MixtureLaws, values: np.ndarray) -> np.ndarray:
     It is E|X - z| - E|X - X'| / 2 for independent X and X' of the law. For one Gaussian it is
     s (t (2 Phi(t) - 1) + 2 phi(t) - pi^(-1/2)) with t = (z - m) / s.
 
+    Args:
+        law: each row's forecast, a mixture of Gaussians.
+        values: what came, z (rows,), NaN where nothing did.
+
     Source: Gneiting and Raftery, Strictly proper scoring rules (2007); Grimit et al. (2006) for mixtures.
     """
     distance_from_z = np.sum(law.weights * _compute_mean_size(values[:, None] - law.means, law.variances), axis=1)
@@ -100,10 +123,15 @@ def crps(law: MixtureLaws, values: np.ndarray) -> np.ndarray:
 
 
 def _compute_distance_of_two(law: MixtureLaws) -> np.ndarray:
-    """Return E|X - X'| of independent X and X' of each row's law (rows,); each pair of parts counts twice."""
+    """Return E|X - X'| of independent X and X' of each row's law (rows,); each pair of parts counts twice.
+
+    It is sum_ij w_i w_j E|Y_ij|, with Y_ij Gaussian of mean m_i - m_j and variance v_i + v_j, for parts i and j of the
+    mixture.
+    """
     total = np.zeros(len(law.weights))
     for i in range(law.weights.shape[1]):
-        differences, variances = law.means[:, [i]] - law.means[:, i:], law.variances[:, [i]] + law.variances[:, i:]
+        differences = law.means[:, [i]] - law.means[:, i:]
+        variances = law.variances[:, [i]] + law.variances[:, i:]
         pairs = law.weights[:, [i]] * law.weights[:, i:] * _compute_mean_size(differences, variances)
         total += pairs[:, 0] + 2 * pairs[:, 1:].sum(axis=1)
     return total
@@ -142,25 +170,34 @@ def average_overlapping(values: np.ndarray, horizon: int) -> ScoreMean:
     if n == 1 or not np.isfinite(mean):
         return ScoreMean(mean, float("nan"))
     lags = min(max(horizon - 1, int(BANDWIDTH * n**0.5)), len(values) - 1)
-    bartlett, overlap, one = _fall_over_lags(lags + 1), _fall_over_lags(horizon), came.astype(float)
+    # W and S as functions of the lag, and the vector of ones.
+    bartlett = _fall_over_lags(lags + 1)
+    overlap = _fall_over_lags(horizon)
+    one = came.astype(float)
     # E[d' W d] = tr(M W M S) with M = I - 1 1' / n over the rows that are not NaN, which `one` marks by ones:
     # tr(W S) + (1' W 1) (1' S 1) / n^2 - 2 / n 1' W S 1.
-    weights_of_rows, overlaps_of_rows = _weigh_neighbours(one, bartlett), _weigh_neighbours(one, overlap)
+    W_one = _weigh_neighbours(one, bartlett)
+    S_one = _weigh_neighbours(one, overlap)
+    one_W_one, one_S_one = one @ W_one, one @ S_one
     shortest = min(len(bartlett), len(overlap))
-    expected = one @ _weigh_neighbours(one, bartlett[:shortest] * overlap[:shortest])
-    total_overlap = one @ overlaps_of_rows
-    expected += (one @ weights_of_rows) * total_overlap / n**2 - 2 / n * (weights_of_rows * one) @ overlaps_of_rows
+    expected = one @ _weigh_neighbours(one, bartlett[:shortest] * overlap[:shortest])  # tr(W S) = sum of W_ij S_ij
+    expected += one_W_one * one_S_one / n**2 - 2 / n * (W_one * one) @ S_one
     # d' W d (1' S 1) / E[d' W d]; over n^2 it is the squared standard error.
     d = np.where(came, values - mean, 0.0)
-    total = d @ _weigh_neighbours(d, bartlett) * total_overlap / expected
+    total = d @ _weigh_neighbours(d, bartlett) * one_S_one / expected
     return ScoreMean(mean, float(np.sqrt(np.maximum(total, 0.0)) / n))
 
 
 def average_coverage(is_inside: np.ndarray, horizon: int, level: float) -> ScoreMean:
-    """Return the mean of what is 1 inside an interval of probability `level`, 0 outside, and NaN where nothing came.
+    """Return the share of forecasts whose interval of probability `level` held what came, with its standard error.
 
-    Its standard error is at least that of an interval that holds what it claims: where all or none were inside, their
-    scatter would say 0.
+    The error is at least that of an interval that holds what it claims: where all or none were inside, their scatter
+    would say 0.
+
+    Args:
+        is_inside: of each row 1 if the value was inside, 0 if outside, NaN where nothing came (rows,).
+        horizon: rows ahead; forecasts from neighbouring rows overlap over so many.
+        level: probability that the interval claims.
     """
     share, error = average_overlapping(is_inside, horizon)
     came = (~np.isnan(is_inside)).astype(float)
@@ -176,6 +213,8 @@ def _fall_over_lags(count: int) -> np.ndarray:
 
 
 def _weigh_neighbours(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return at each row the sum of its neighbours' values (rows,), weighted by their distance: `weights[distance]`."""
-    kernel, reach = np.concatenate([weights[:0:-1], weights]), len(weights) - 1
-    return np.asarray(np.convolve(values, kernel)[reach : reach + len(values)])
+    """Return s_i = sum_j weights[|i - j|] values_j for each row i, over rows nearer than len(weights), itself too."""
+    reach = len(weights) - 1
+    symmetric = np.concatenate([weights[:0:-1], weights])  # weights of the distances -reach ... reach
+    # The full convolution begins `reach` rows before the first row.
+    return np.asarray(np.convolve(values, symmetric)[reach : reach + len(values)])

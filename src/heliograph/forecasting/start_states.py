@@ -33,6 +33,8 @@ def find_origin(source: object) -> Origin:
 def find_common_origin(source: Sources) -> Origin:
     """Return where a forecast starts; a list of sources gives one origin with an axis over the sources.
 
+    `source`: a result or a live object, or a list of these.
+
     Raises:
         ValueError: what `find_origin` refuses, an empty list, sources of other models or other steps.
     """
@@ -68,7 +70,13 @@ def _stack_origins(origins: list[Origin]) -> Origin:
 
 
 def _check_like_first(name: str, head: Origin, origin: Origin) -> None:
-    """Raise ValueError unless an origin has the model, the steps and the kind of times of the first origin, `head`."""
+    """Raise ValueError unless an origin has the model, the steps and the kind of times of the first origin, `head`.
+
+    Args:
+        name: name of the source, for messages.
+        head: origin of the first source.
+        origin: origin of this source.
+    """
     if origin.model is not head.model:
         raise fail(name, "the filter or network of the source before it", "another one")
     if not np.array_equal([head.spacing, head.months], [origin.spacing, origin.months], equal_nan=True):
@@ -78,14 +86,15 @@ def _check_like_first(name: str, head: Origin, origin: Origin) -> None:
 
 
 def _stack_trees(trees: list[PyTree]) -> PyTree:
-    """Return trees of one structure as one whose leaves have a leading axis."""
+    """Return trees of arrays of one structure as one tree, whose arrays have a leading axis over the trees."""
     return jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *trees)
 
 
 def _stack_estimates(estimates: list[Estimate]) -> Estimate:
-    """Return estimates of single plants as one estimate of several, with the claim of the first that claims anything.
+    """Return estimates of single plants as one estimate of several, with a leading axis over the plants.
 
-    Covariances of estimates with another claim are NaN.
+    An estimate has one claim of its covariances ("exact", "upper", "nominal" or "none"): that of the first plant that
+    claims anything. Covariances of plants with another claim are NaN.
     """
     model = next((estimate for estimate in estimates if estimate.claim != "none"), estimates[0])
     unknown = np.full(np.shape(model.covariance), np.nan)

@@ -42,7 +42,7 @@ class Crossing:
 
     @property
     def first(self) -> np.ndarray:
-        """Probability that each time is the first beyond (times,); what is missing to 1 is `never`."""
+        """Probability that each time is the first at which it is beyond (times,); with `never` they sum to 1."""
         return np.diff(self.by, prepend=0.0)
 
     @property

@@ -13,7 +13,7 @@ from heliograph.numerics.process.optional_packages import check_installed
 if TYPE_CHECKING:  # an extra
     import xarray as xr
 
-BLOCK = 64  # draws whose rows are computed side by side
+DRAWS_AT_ONCE = 64  # draws whose rows are computed side by side
 METHOD: Method = "hessian"  # the curvature of the likelihood alone
 
 
@@ -21,8 +21,8 @@ def make_inference_data(solution: Solution, draws: int, seed: int) -> Any:
     """Return draws of the free numbers, and the log-likelihood of each row at each of them, as ArviZ keeps them.
 
     ArviZ compares and plots Bayesian fits. The draws are normal about the maximum likelihood estimate, with the inverse
-    curvature of the log-likelihood there as covariance (the Laplace approximation). They are drawn in coordinates on
-    unconstrained coordinates (such as logarithms of positive numbers).
+    curvature of the log-likelihood there as covariance (the Laplace approximation). They are drawn in unconstrained
+    coordinates (such as logarithms of positive numbers).
 
     Args:
         solution: the fit: its maximum `x` (p,), covariance and likelihood.
@@ -49,7 +49,7 @@ def make_inference_data(solution: Solution, draws: int, seed: int) -> Any:
     covariance, _ = solution.covariance(METHOD)
     points = solution.x + random.multivariate_normal(np.zeros(len(solution.x)), covariance, draws, method="cholesky")
     density = np.concatenate(
-        [_evaluate_row_likelihoods(solution, points[k : k + BLOCK]) for k in range(0, draws, BLOCK)]
+        [_evaluate_row_likelihoods(solution, points[k : k + DRAWS_AT_ONCE]) for k in range(0, draws, DRAWS_AT_ONCE)]
     )
     groups = {
         "posterior": _make_posterior(solution, points),
@@ -72,7 +72,11 @@ def _evaluate_row_likelihoods(solution: Solution, points: np.ndarray) -> np.ndar
 def _make_posterior(solution: Solution, points: np.ndarray) -> "xr.Dataset":
     """Return the free numbers of the table (for instance logarithms of variances) at posterior draws, as a dataset.
 
-    `points`: draws of their unconstrained coordinates (draws, p). All draws are one chain, axis 0.
+    All draws are one chain, axis 0.
+
+    Args:
+        solution: the fit.
+        points: draws of the unconstrained coordinates of the free numbers (draws, p).
     """
     values = np.stack([solution.parameters.entries_at(x) for x in points])  # (draws, entries)
     names = [entry.name for entry in solution.parameters.entries]
@@ -82,7 +86,9 @@ def _make_posterior(solution: Solution, points: np.ndarray) -> "xr.Dataset":
 def _select_arrived_rows(solution: Solution, density: np.ndarray) -> "xr.Dataset":
     """Return log p (draws, rows) of the rows in which something arrived, with the recording and row of each.
 
-    `density`: log p of all rows of all recordings (draws, rows).
+    Args:
+        solution: the fit, with its data.
+        density: log p of all rows of all recordings, one recording after the other (draws, rows).
     """
     data = solution.surface.data
     rows = [(i, k) for i, steps in enumerate(data.lengths) for k in range(steps)]
@@ -98,7 +104,12 @@ def _make_total_likelihood_dataset(density: np.ndarray) -> "xr.Dataset":
 
 
 def _make_dataset(content: dict[str, Any], further_coordinates: dict[str, Any] | None = None) -> "xr.Dataset":
-    """Return a dataset of arrays (chain, draw, ...), given as {name: (axes, values)}; the one chain has number 0."""
+    """Return a dataset of arrays (chain, draw, ...), given as {name: (axes, values)}; the one chain has number 0.
+
+    Args:
+        content: {name: (names of the axes, values)}, of which the first two axes are chain and draw.
+        further_coordinates: {name: (axis, values)} of other axes; none unless given.
+    """
     import xarray as xr
 
     _axes, values = next(iter(content.values()))

@@ -56,12 +56,19 @@ def round_to_width(value: float, width: float) -> str:
     """
     if not np.isfinite(value) or value == 0 or not np.isfinite(width) or width <= 0:
         return f"{value:.4g}"
+    # From the first digit of the value to the second digit of the width.
     digits = int(np.floor(np.log10(abs(value)))) - int(np.floor(np.log10(width))) + 2
     return f"{value:.{min(max(digits, 2), 8)}g}"
 
 
 def make_unidentified_row(entry: TableEntry, value: float, form: Form) -> Row:
-    """Return the row of a number that the data do not identify: where the search ended, without an interval."""
+    """Return the row of a number that the data do not identify: where the search ended, without an interval.
+
+    Args:
+        entry: the number, with its name.
+        value: where the search ended.
+        form: form of the likelihood that was maximised.
+    """
     return Row(
         name=entry.name,
         estimate=value,

@@ -11,7 +11,7 @@ import numpy as np
 
 from heliograph.learning.estimate_row import Row, make_unidentified_row
 from heliograph.learning.free_parameters import Parameters, TableEntry
-from heliograph.learning.likelihood.multistart import FURTHER, HighestPoint
+from heliograph.learning.likelihood.multistart import WAY_TO_END, HighestPoint
 from heliograph.learning.likelihood.objective import Form
 from heliograph.learning.likelihood.parameter_transforms import (
     from_unconstrained,
@@ -20,7 +20,7 @@ from heliograph.learning.likelihood.parameter_transforms import (
 )
 from heliograph.learning.likelihood.surface import LikelihoodSurface
 from heliograph.learning.long_run_covariance import (
-    DRAWS,
+    BOOTSTRAP_DRAWS,
     LEVEL,
     Method,
     Scores,
@@ -35,19 +35,19 @@ from heliograph.learning.long_run_covariance import (
 from heliograph.learning.unidentified_directions import InformationRank, find_rank_of_late_rows
 from heliograph.numerics.types import Bool, Float
 
-WIDE = 1.0  # standard error of a logarithm or a logit above which an interval is cut out of the likelihood
-END = 40.0  # steps of a logarithm or a logit to what cannot be told from the end of its domain
-REAL_END = 1000.0  # times two standard errors, to where a real number's likelihood does not fall at all
-ALONG = 1e-5  # share of a number's derivative that may lie along a ridge
+WIDE_ERROR = 1.0  # standard error of a logarithm or a logit above which an interval is cut out of the likelihood
+FURTHEST_LOGARITHM = 40.0  # steps of a logarithm or a logit to what cannot be told from the end of its domain
+FURTHEST_REAL = 1000.0  # times two standard errors, to where a real number's likelihood does not fall at all
+LARGEST_SHARE_ALONG_RIDGE = 1e-5  # share of a number's derivative that may lie along a ridge
 
 
 @dataclass(frozen=True, repr=False)
 class Solution:
-    """Maximum of the likelihood in one form.
+    """Maximum of the likelihood in one form ("linear" or "conditional"), with the table of estimates.
 
     Args:
-        surface: the likelihood.
-        top: where the search ended.
+        surface: the likelihood as a function of the free numbers.
+        top: where the search for its maximum ended.
         ridges: number of directions in which the likelihood does not change.
     """
 
@@ -101,19 +101,22 @@ class Solution:
 
     @cached_property
     def scores(self) -> Scores:
-        """Scores of each step, by recording, among active coordinates."""
+        """For each recording the score of each row, the gradient of its log-likelihood (steps, active coordinates)."""
         score = self.surface.evaluate_rows(self.top.x[None]).score[0][..., self.active]
         return [s[:steps] for s, steps in zip(score, self.surface.data.lengths, strict=True)]
 
     @cached_property
     def rank(self) -> InformationRank:
-        """Flat directions of active coordinates, along which l is constant: as many as `ridges`; and all others."""
+        """Directions of active coordinates in which the likelihood is constant, as many as `ridges`, and all others."""
         information = self.surface.evaluations(self.top.x[None]).late[0]  # of the second half of the rows
         return find_rank_of_late_rows(information[np.ix_(self.active, self.active)], self.ridges)
 
     @cached_property
     def hessian(self) -> Float[np.ndarray, "r r"]:
-        """Hessian of -l along the r identified directions (`basis`); the information if it is not positive definite."""
+        """Hessian of -l along the r identified directions, B' H B with B = `basis`.
+
+        If it is not positive definite, as by rounding, the Gauss-Newton information takes its place.
+        """
         hessian_of_active = self.surface.hessian(self.top.x, self.active)[np.ix_(self.active, self.active)]
         hessian = self._project_on_identified(hessian_of_active)
         least_eigenvalue = np.linalg.eigvalsh(hessian)[:1].sum()  # 0 if there is no direction
@@ -124,7 +127,10 @@ class Solution:
 
     @property
     def basis(self) -> Float[np.ndarray, "active r"]:
-        """Directions that the data identify, in columns of active coordinates (`rank.rest` has units `rank.unit`)."""
+        """Directions of the active coordinates that the data identify, in columns.
+
+        `rank.rest` has them in units of each coordinate's standard error, `rank.unit`.
+        """
         return np.asarray(self.rank.unit[:, None] * self.rank.rest)
 
     def _project_on_identified(self, matrix: np.ndarray) -> np.ndarray:
@@ -133,7 +139,10 @@ class Solution:
 
     @cached_property
     def in_few_stretches(self) -> Bool[np.ndarray, " active"]:
-        """Which active coordinates (active,) are real numbers whose information is in a few stretches of the data."""
+        """Which active coordinates (active,) are real numbers that only a few stretches of the data inform of.
+
+        The scores of such a number, as of a bias after a rare event, do not tell how far its estimate varies.
+        """
         free = np.flatnonzero(self.active & self.surface.domains.free)
         in_few_stretches = np.zeros(len(self.active), dtype=bool)
         if len(free) and not self.rank.flat.size:
@@ -147,7 +156,8 @@ class Solution:
         estimated by `method`. Numbers whose information is in a few stretches of the data (`in_few_stretches`) have the
         model's J.
         """
-        scores, by_model = self.scores, np.zeros((len(self.in_few_stretches), len(self.in_few_stretches)))
+        scores = self.scores
+        by_model = np.zeros((len(self.in_few_stretches), len(self.in_few_stretches)))  # the part of J by the model
         if self.in_few_stretches.any():
             # Here all directions are identified, so that the Hessian can be brought back to the active coordinates.
             inverse = np.linalg.inv(self.basis)
@@ -161,7 +171,12 @@ class Solution:
         return np.asarray(self.basis @ sandwich @ self.basis.T), estimate.freedom
 
     def rows(self, method: Method = "cosines", level: float = LEVEL) -> tuple[Row, ...]:
-        """Return the table of estimates by this form, with intervals by a method; it is computed at the first call."""
+        """Return the table of estimates by this form, with intervals by a method; it is computed at the first call.
+
+        Args:
+            method: how intervals are computed, as of `Fit.rows`.
+            level: probability with which an interval holds the number.
+        """
         key = method, level
         if key not in self._tables:
             self._tables[key] = self._make_rows(method, level)
@@ -173,7 +188,10 @@ class Solution:
         return ("cosines", LEVEL) in self._tables
 
     def describe_with_cheap_errors(self) -> list[str]:
-        """Return a line for each number: its estimate, and an interval by the expected information at the maximum."""
+        """Return a line for each number: its estimate, and an interval by the expected information at the maximum.
+
+        A printed fit shows it where `rows` were not asked for: it needs no derivatives by row.
+        """
         active, values = self.active, self.parameters.entries_at(self.x)
         # A number's variance is g' I^-1 g, with its derivative g, unconstrained too, by the active coordinates.
         information = self.surface.evaluations(self.top.x[None]).information[0][np.ix_(active, active)]
@@ -189,7 +207,12 @@ class Solution:
     def _describe_entry(self, entry: TableEntry, value: float, slope: np.ndarray, error: float) -> str:
         """Return in words an estimate `value` and its interval, symmetric in the unconstrained number (log or logit).
 
-        `error`: its standard error there. `slope`: its derivative, which shows whether it is identified.
+        Args:
+            entry: the number, with its domain.
+            value: its estimate.
+            slope: derivative of the unconstrained number by the active coordinates, which shows whether it is
+                identified.
+            error: standard error of the unconstrained number.
         """
         if entry.coordinate is not None and not self.active[entry.coordinate]:
             return f"{value:>10.4g}  (at the end of its domain)"
@@ -202,10 +225,16 @@ class Solution:
         return f"{row.value:>10}  (about {row.interval})"
 
     def _make_rows(self, method: Method, level: float) -> tuple[Row, ...]:
-        """Return a row for each number of the table: at a boundary, not identified, or with an interval by `method`."""
+        """Return a row for each number of the table: at a boundary, not identified, or with an interval by `method`.
+
+        Args:
+            method: how intervals are computed, as of `Fit.rows`.
+            level: probability with which an interval holds the number.
+        """
         covariance, freedom = self.covariance("hessian" if method == "profile" else method)
         # Estimates at the maximum, and their derivatives by the active coordinates x (logarithms, logits or numbers).
-        values, slopes = self.parameters.entries_at(self.x), self.parameters.slopes(self.top.x)[:, self.active]
+        values = self.parameters.entries_at(self.x)
+        slopes = self.parameters.slopes(self.top.x)[:, self.active]
         rows = []
         for entry, value, slope in zip(self.parameters.entries, values, slopes, strict=True):
             error = float(np.sqrt(max(slope @ covariance @ slope, 0.0)))
@@ -246,14 +275,13 @@ class Solution:
         coordinate = entry.coordinate  # None of numbers of a simplex or a covariance, which have none of their own
         is_in_few_stretches = False
         if coordinate is not None:
-            hardly_known = self.surface.domains.single[coordinate] and error > WIDE
+            hardly_known = self.surface.domains.single[coordinate] and error > WIDE_ERROR
             if hardly_known or method == "profile":
-                first = min(error, WIDE) * np.array([-2.0, 2.0])  # where the search for either end begins
+                first = min(error, WIDE_ERROR) * np.array([-2.0, 2.0])  # where the search for either end begins
                 low, high = self._find_profile_ends(coordinate, first, find_profile_drop(level))
                 return low, high
-            is_in_few_stretches = bool(
-                self.in_few_stretches[np.count_nonzero(self.active[:coordinate])]
-            )  # its place among active ones
+            index_among_active = np.count_nonzero(self.active[:coordinate])
+            is_in_few_stretches = bool(self.in_few_stretches[index_among_active])
         center = float(to_unconstrained(entry.domain, value))
         # Resampled blocks do not show how a number varies whose information is in a few stretches of the data.
         if method == "bootstrap" and not is_in_few_stretches:
@@ -263,7 +291,14 @@ class Solution:
         return center - half, center + half
 
     def _make_row(self, entry: TableEntry, value: float, error: float, ends: tuple[float, float]) -> Row:
-        """Return the row of an identified number, from its error and its interval in the unconstrained coordinate."""
+        """Return the row of an identified number.
+
+        Args:
+            entry: the number, with its name and domain.
+            value: its estimate.
+            error: standard error of its unconstrained coordinate (logarithm, logit or the number itself).
+            ends: ends of its interval in that coordinate.
+        """
         low, high = sorted(float(from_unconstrained(entry.domain, end)) for end in ends)
         slope = abs(float(slope_from_unconstrained(entry.domain, to_unconstrained(entry.domain, value))))
         return Row(
@@ -280,18 +315,23 @@ class Solution:
     def identifies(self, slopes: Float[np.ndarray, " active"]) -> bool:
         """Return whether the data identify a function f of the numbers: f does not change where l does not (ridges).
 
-        `slopes`: df/dx by the active coordinates x. Its component along ridges (`rank.flat`) is at most ALONG |df/dx|.
+        `slopes`: df/dx by the active coordinates x. Its component along ridges (`rank.flat`) is at most
+        LARGEST_SHARE_ALONG_RIDGE |df/dx|.
         """
         scaled_slopes = self.rank.unit * slopes  # in units of each coordinate's standard error
         size = np.linalg.norm(scaled_slopes)
-        return bool(size > 0 and np.linalg.norm(scaled_slopes @ self.rank.flat) <= ALONG * size)
+        return bool(size > 0 and np.linalg.norm(scaled_slopes @ self.rank.flat) <= LARGEST_SHARE_ALONG_RIDGE * size)
 
     def _bootstrap_interval(self, slopes: np.ndarray, level: float) -> np.ndarray:
-        """Return both ends of an interval, relative to the estimate, from DRAWS sums of blocks of scores drawn again.
+        """Return both ends of an interval, relative to the estimate, by a bootstrap of blocks of scores.
 
-        `slopes`: the number's derivative by the active coordinates. A sum of scores moves the maximum by H^-1 times it.
+        A sum of scores moves the maximum by H^-1 times it.
+
+        Args:
+            slopes: derivatives of the number's unconstrained coordinate by the active coordinates (active,).
+            level: probability with which the interval holds the number.
         """
-        sums = bootstrap_block_sums([s @ self.basis for s in self.scores], draws=DRAWS, seed=0)
+        sums = bootstrap_block_sums([s @ self.basis for s in self.scores], draws=BOOTSTRAP_DRAWS, seed=0)
         moves = slopes @ self.basis @ np.linalg.solve(self.hessian, sums.T)
         return np.asarray(np.quantile(moves, [(1 - level) / 2, (1 + level) / 2]))
 
@@ -299,11 +339,17 @@ class Solution:
         """Return the row of a number at an end of its domain: its interval is from there to one point inside.
 
         At an end 2 * (fall of l) is chi-squared with probability 1/2 and else 0: P(fall > d) = P(chi2 > 2 d) / 2. So an
-        interval of 95 % ends where an ordinary one of 90 % = 2 * 95 % - 1 does. FURTHER: where the search begins.
+        interval of 95 % ends where an ordinary one of 90 % = 2 * 95 % - 1 does.
+
+        Args:
+            entry: the number.
+            value: its estimate, the end of its domain.
+            level: probability with which the interval holds the number.
         """
         assert entry.coordinate is not None
         outward = self.top.ends[entry.coordinate]  # -1 or 1
-        first, drop = np.array([-outward * FURTHER]), find_profile_drop(2 * level - 1)
+        first = np.array([-outward * WAY_TO_END])  # distance inwards at which the search begins
+        drop = find_profile_drop(2 * level - 1)
         (end,) = self._find_profile_ends(entry.coordinate, first, drop)
         limit = float(from_unconstrained(entry.domain, end if np.isfinite(end) else -outward * np.inf))
         return Row(
@@ -322,7 +368,7 @@ class Solution:
 
         `first` (sides,): signed distances from the maximum at which searches begin; they end at `furthest`.
         """
-        furthest = REAL_END * np.abs(first).max() if self.surface.domains.free[coordinate] else END
+        furthest = FURTHEST_REAL * np.abs(first).max() if self.surface.domains.free[coordinate] else FURTHEST_LOGARITHM
         return self.surface.find_profile_crossings(
             self.top.x, self.total, coordinate=coordinate, first=first, furthest=furthest, drop=drop, active=self.active
         )

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from typing_extensions import TypeAliasType
@@ -12,7 +12,7 @@ from heliograph.learning.fit_result import Fit
 from heliograph.learning.identifiability import identify_by_recording
 from heliograph.learning.likelihood.climbs import ClimbEnds
 from heliograph.learning.likelihood.data import gather_data
-from heliograph.learning.likelihood.multistart import AWAY, SPREAD, MaximumSearch
+from heliograph.learning.likelihood.multistart import SPREAD_OF_LOGARITHMS, SPREAD_OF_REALS, MaximumSearch
 from heliograph.learning.likelihood.objective import make_objectives
 from heliograph.learning.likelihood.surface import LikelihoodSurface
 from heliograph.learning.packet_losses.delay_law import Delays, learn_delays
@@ -86,19 +86,34 @@ def fit(
     identified = identify_by_recording(surfaces[-1], points[0], seed)
     # The maximum of each form, and the estimates and intervals in the sentences on what is identified.
     solutions, ends, stopped = _maximise_forms(surfaces, points, seed, identified.ridges, report)
+    best = solutions[-1]
     try:
         if identified.sentences:  # far from the maximum rounding may hide what the data tell near it
-            identified = identified.or_sharper(identify_by_recording(surfaces[-1], solutions[-1].top.x, seed))
+            identified = identified.or_sharper(identify_by_recording(surfaces[-1], best.top.x, seed))
             solutions = [replace(solution, ridges=identified.ridges) for solution in solutions]
-        identified = identified.at(solutions[-1])
+        identified = identified.at(solutions[-1])  # with estimates and intervals
     except KeyboardInterrupt:  # without these intervals the fit is whole
         stopped = True
     return Fit(description, tuple(solutions), identified, ends=ends, stopped=stopped, delays=delays)
 
 
+class _FormMaxima(NamedTuple):
+    """Maxima of the forms of the likelihood.
+
+    Args:
+        solutions: the maximum of each form, the one that counts last.
+        ends: log-likelihoods at which the first form's climbs ended (starts,).
+        stopped: whether Ctrl-C stopped the search; then the last solution is the best point so far.
+    """
+
+    solutions: list[Solution]
+    ends: Float[np.ndarray, " starts"]
+    stopped: bool
+
+
 def _maximise_forms(
     surfaces: list[LikelihoodSurface], points: np.ndarray, seed: int, ridges: int, progress: Progress
-) -> tuple[list[Solution], Float[np.ndarray, " starts"], bool]:
+) -> _FormMaxima:
     """Return the maximum of each form of the likelihood; the first is searched from all starts, the next from its best.
 
     Args:
@@ -108,11 +123,11 @@ def _maximise_forms(
         ridges: number of directions in which the likelihood does not change.
         progress: called with a line of text at each step.
 
-    Returns:
-        The solutions, log-likelihoods at the ends of the first form's climbs, and whether Ctrl-C stopped the search:
-        then the last solution is the best point so far. Before there is one, KeyboardInterrupt is raised.
+    Raises:
+        KeyboardInterrupt: Ctrl-C before there was a first point; after it the best point so far is returned.
     """
-    ends, solutions = np.zeros(0), list[Solution]()
+    ends = np.zeros(0)
+    solutions = list[Solution]()
     for surface in surfaces:
         search = MaximumSearch(surface, _make_climb_reporter(surface, progress))
         try:
@@ -121,19 +136,24 @@ def _maximise_forms(
             if search.best is None and not solutions:
                 raise
             if search.best is None:  # the form before has the best so far
-                return solutions, ends, True
+                return _FormMaxima(solutions, ends, stopped=True)
             top, stopped = search.best, True
         if not len(ends):
             ends = search.ends
         solutions.append(Solution(surface, top, ridges))
         if stopped:
-            return solutions, ends, True
+            return _FormMaxima(solutions, ends, stopped=True)
         points = top.x[None]  # where the next form begins
-    return solutions, ends, False
+    return _FormMaxima(solutions, ends, stopped=False)
 
 
 def _convert_event_tables(recording: Any) -> tuple[object, dict[str, Delays]]:
-    """Return the recordings with tables of events turned into rows, and the law of delays of each node in them."""
+    """Return the recordings with tables of events turned into rows, and the law of delays of each node in them.
+
+    An event table (`heliograph.files.EventTable`) has messages with the times when they were measured and logged, from
+    which delays are learned. Recordings of another kind stay as they are, and give no delays. `recording`: one
+    recording, or a list of several.
+    """
     recordings = recording if isinstance(recording, list) else [recording]
     tables = [table for table in recordings if hasattr(table, "lateness")]  # only these know how late a message came
     if not tables:
@@ -149,7 +169,14 @@ def _convert_event_tables(recording: Any) -> tuple[object, dict[str, Delays]]:
 
 
 def _choose_starts(surface: LikelihoodSurface, count: int, seed: int) -> Float[np.ndarray, "starts p"]:
-    """Return `count` starts at which the likelihood is finite: the given one, and others drawn around it.
+    """Return the starts of a search (starts, p): the given one, and others drawn around it.
+
+    The likelihood is finite at all of them. Coordinates are unconstrained: logarithms, logits and real numbers.
+
+    Args:
+        surface: the likelihood over the free numbers, with the given start.
+        count: number of starts.
+        seed: of the random numbers.
 
     Raises:
         ValueError: a start that is impossible, or a number on which nothing depends.
@@ -162,18 +189,26 @@ def _choose_starts(surface: LikelihoodSurface, count: int, seed: int) -> Float[n
         step = int(np.argmax(~np.isfinite(by_row)))
         expected = "numbers under which the recording is possible"
         raise fail("start of the fit", expected, f"a log-likelihood of {total} from step {step} on")
-    # Draw the others uniformly around it: logarithms and logits within SPREAD; real numbers within half their size or
-    # AWAY standard errors, whichever is more, or within SPREAD if both are 0 (no information gives no standard error).
+    # Draw the others uniformly around it: logarithms and logits within SPREAD_OF_LOGARITHMS; real numbers within half
+    # their size or SPREAD_OF_REALS standard errors, whichever is more, or within SPREAD_OF_LOGARITHMS if both are 0 (no
+    # information gives no standard error).
     free, deviation = surface.domains.free, surface.standard_errors(start)
-    far = np.maximum(np.abs(start) / 2, AWAY * np.where(np.isfinite(deviation), deviation, 0.0))
-    drawn = rng.uniform(-1, 1, (count - 1, len(start))) * np.where(free & (far > 0), far, SPREAD)
+    far = np.maximum(np.abs(start) / 2, SPREAD_OF_REALS * np.where(np.isfinite(deviation), deviation, 0.0))
+    drawn = rng.uniform(-1, 1, (count - 1, len(start))) * np.where(free & (far > 0), far, SPREAD_OF_LOGARITHMS)
     points = surface.move_to_finite_likelihood(start + np.concatenate([np.zeros((1, len(start))), drawn]), start)
     _require_information_on_each_number(surface, points)
     return points
 
 
 def _require_information_on_each_number(surface: LikelihoodSurface, points: np.ndarray) -> None:
-    """Raise ValueError for a free number of which the data have no information, or no derivative, at all points."""
+    """Raise ValueError for a free number of which the data have no information, or no derivative, at all points.
+
+    The estimate of such a number could be anything.
+
+    Args:
+        surface: the likelihood over the free numbers.
+        points: the starts of the search (starts, p).
+    """
     information = np.diagonal(surface.evaluations(points).information, axis1=1, axis2=2)
     for name, own in zip(surface.objective.description.parameters.coordinates, information.T, strict=True):
         if np.all(np.isnan(own)):
@@ -183,12 +218,21 @@ def _require_information_on_each_number(surface: LikelihoodSurface, points: np.n
 
 
 def _make_climb_reporter(surface: LikelihoodSurface, say: Progress) -> Callable[[ClimbEnds], None]:
-    """Return the function that reports, after each step of a search, how many climbs are done and how high they are."""
+    """Return the function that reports, after each step of a search, how many climbs are done and how high they are.
+
+    Args:
+        surface: the likelihood that is climbed.
+        say: called with a line of text.
+    """
     form = surface.objective.form
 
     def report(climbs: ClimbEnds) -> None:
-        """Say which step the climbs are at, how many have converged, and the highest log-likelihood so far."""
-        best, done = np.nanmax(climbs.total), int(climbs.converged.sum())
+        """Say which step the climbs are at, how many have converged, and the highest log-likelihood so far.
+
+        `form` is the form of the likelihood, and `say` takes the line of text.
+        """
+        best = np.nanmax(climbs.total)
+        done = int(climbs.converged.sum())
         say(f"{form}: step {climbs.steps}, {done} of {len(climbs.x)} starts done, {best:.6g}")
 
     return report

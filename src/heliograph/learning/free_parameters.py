@@ -1,4 +1,4 @@
-"""Free numbers as unconstrained coordinates, in which a fit searches, and as the entries of a user's table."""
+"""Free numbers as unconstrained coordinates, in which a fit searches, and as entries of the table of estimates."""
 
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -23,9 +23,15 @@ from heliograph.numerics.types import Array, Float
 @readable
 @dataclass(frozen=True)
 class Parameter:
-    """A free number, which may be an array: its name, start and domain.
+    """A free number of a network, which a fit estimates; it may be an array.
 
-    Its coordinates are unbounded numbers, on which it is searched; its entries are the numbers of the table.
+    A fit searches by its unconstrained coordinates: numbers without bounds, such as the logarithm of a variance. Its
+    entries are the single numbers in it that the table of estimates shows, a row for each.
+
+    Args:
+        name: its name.
+        start: the value, with the number's shape, from which the search begins.
+        domain: which values it may have: an interval, probabilities that sum to 1 ("simplex") or a covariance.
     """
 
     name: str
@@ -34,14 +40,14 @@ class Parameter:
 
     @property
     def size(self) -> int:
-        """Return how many coordinates it has."""
+        """Return how many unconstrained coordinates it has."""
         return count_coordinates(self.domain, self.start.shape)
 
     @property
     def entry_names(self) -> tuple[str, ...]:
-        """Return the names of the number's entries in the table; a covariance has those on and below the diagonal.
+        """Return the names of the number's entries in the table of estimates, such as ("Q[0,0]", "Q[1,0]", "Q[1,1]").
 
-        `self.start`: the value, with the number's shape, from which a search begins.
+        A covariance, which is symmetric, has only the entries on and below the diagonal.
         """
         if self.start.ndim == 0:
             return (self.name,)
@@ -51,30 +57,30 @@ class Parameter:
         return tuple(f"{self.name}[{','.join(map(str, index))}]" for index in shown)
 
     def list_entries(self, value: Array) -> Array:
-        """Return the entries (entries,) of the table from a value of the free number."""
+        """Return a value of the free number as a vector of its entries in the table (entries,), row after row."""
         return value[np.tril_indices(len(value))] if self.domain.kind == "covariance" else value.reshape(-1)
 
     def entries_at(self, x: Float[np.ndarray, " size"]) -> Float[np.ndarray, " entries"]:
-        """Return the entries of the table of estimates (entries,) that this number has at unconstrained coordinates x.
+        """Return the number's entries (entries,), as the table of estimates shows them, from its coordinates x (size,).
 
-        Coordinates (size,) are the logarithm or logit of a number whose domain has ends, else the number itself.
+        A variance, for instance, has the coordinate x = log(variance) and the entry exp(x).
         """
         with jax.enable_x64(True):
-            return np.asarray(self._trace_entries(np.asarray(x)))
+            return np.asarray(self._compute_entries(np.asarray(x)))
 
     def differentiate_entries(self, x: Float[np.ndarray, " size"]) -> Float[np.ndarray, "entries size"]:
-        """Return the derivatives (entries, size) of the entries at unconstrained coordinates x (size,).
+        """Return the derivatives (entries, size) of the number's entries by its coordinates, at x (size,).
 
-        Each entry of an interval has its own coordinate, so the derivatives are diagonal. JAX differentiates the
-        others.
+        Each entry of an interval has its own coordinate, so the derivatives are diagonal. JAX differentiates those of
+        a simplex or a covariance.
         """
         if self.domain.kind == "interval":
             return np.diag(slope_from_unconstrained(self.domain, x))
         with jax.enable_x64(True):
-            return np.asarray(jax.jacfwd(self._trace_entries)(jnp.asarray(x)))
+            return np.asarray(jax.jacfwd(self._compute_entries)(jnp.asarray(x)))
 
-    def _trace_entries(self, x: Array) -> Array:
-        """Return the entries (entries,) at coordinates x (size,), in operations that JAX can trace."""
+    def _compute_entries(self, x: Array) -> Array:
+        """Return the entries (entries,) at coordinates x (size,), by operations that JAX can differentiate."""
         return self.list_entries(map_from_unconstrained(self.domain, self.start.shape, x))
 
     @property
@@ -91,7 +97,14 @@ class Parameter:
 
 
 class TableEntry(NamedTuple):
-    """Number of the table: its name, its domain, and the index of its coordinate; None if it has none of its own."""
+    """A number that the table of estimates shows.
+
+    Args:
+        name: its name.
+        domain: which values it may have.
+        coordinate: index of its own coordinate among all unconstrained coordinates x (p,). None for an entry of a
+            simplex or a covariance, which depends on several.
+    """
 
     name: str
     domain: Domain
@@ -101,7 +114,9 @@ class TableEntry(NamedTuple):
 @readable
 @dataclass(frozen=True)
 class Parameters:
-    """Free numbers of a network in the order in which it asks for them.
+    """All free numbers of a network, in the order in which the function that builds it asks for them.
+
+    A point of the search is the vector x (p,) of the unconstrained coordinates of all numbers, one after the other.
 
     Args:
         every: the numbers.
@@ -111,19 +126,19 @@ class Parameters:
 
     @property
     def size(self) -> int:
-        """Return how many coordinates all have together."""
+        """Return p, how many unconstrained coordinates all numbers have together."""
         return sum(parameter.size for parameter in self.every)
 
     @property
     def start(self) -> Float[np.ndarray, " p"]:
-        """Return the unconstrained coordinates (p,) at which all free numbers (`self.every`) start."""
+        """Return the point x (p,) from which a search begins: the coordinates of all numbers' starts."""
         return np.concatenate(
             [map_to_unconstrained(parameter.name, parameter.domain, parameter.start) for parameter in self.every]
         )
 
     @property
     def entries(self) -> tuple[TableEntry, ...]:
-        """Return the entries of the table in order, each with the index of its own coordinate, or None."""
+        """Return the numbers that the table of estimates shows, in its order."""
         results, begin = [], 0
         for parameter in self.every:
             has_own_coordinates = parameter.domain.kind == "interval"  # one coordinate for each entry
@@ -134,10 +149,10 @@ class Parameters:
 
     @property
     def coordinates(self) -> tuple[str, ...]:
-        """Return the names of all unconstrained coordinates.
+        """Return the names of all p unconstrained coordinates, for messages.
 
-        A number of an interval has a coordinate with the name of each entry. A simplex or a covariance has numbered
-        ones, NAME(0), NAME(1), ...
+        Each entry of a number on an interval has its own coordinate, which gets the entry's name. The coordinates of a
+        simplex or a covariance are no single entry's, and are numbered: NAME(0), NAME(1), ...
         """
         return tuple(
             parameter.entry_names[i] if parameter.domain.kind == "interval" else f"{parameter.name}({i})"
@@ -146,11 +161,14 @@ class Parameters:
         )
 
     def values(self, x: Array) -> dict[str, Array]:
-        """Return the free numbers {name: number} at unconstrained coordinates x (p,), in operations that JAX traces."""
+        """Return the free numbers {name: number} at unconstrained coordinates x (p,), in operations that JAX traces.
+
+        The coordinates of all numbers stand one after another in x.
+        """
         ends = np.cumsum([0, *(parameter.size for parameter in self.every)])
         return {
-            parameter.name: map_from_unconstrained(parameter.domain, parameter.start.shape, x[a:b])
-            for parameter, a, b in zip(self.every, ends[:-1], ends[1:], strict=True)
+            parameter.name: map_from_unconstrained(parameter.domain, parameter.start.shape, x[begin:end])
+            for parameter, begin, end in zip(self.every, ends[:-1], ends[1:], strict=True)
         }
 
     def known(self, x: Float[np.ndarray, " p"]) -> dict[str, Any]:
@@ -159,11 +177,11 @@ class Parameters:
             return {name: to_plain_number(value) for name, value in self.values(np.asarray(x)).items()}
 
     def entries_at(self, x: Float[np.ndarray, " p"]) -> Float[np.ndarray, " entries"]:
-        """Return the values of all entries of the table (entries,) at unconstrained coordinates x (p,)."""
+        """Return all numbers of the table of estimates (entries,) at unconstrained coordinates x (p,)."""
         return np.concatenate([parameter.entries_at(single) for parameter, single in self._split_point(x)])
 
     def jacobian(self, x: Float[np.ndarray, " p"]) -> Float[np.ndarray, "entries p"]:
-        """Return the derivatives of all entries of the table by the coordinates x (entries, p)."""
+        """Return the derivatives (entries, p) of all numbers of the table by the coordinates, at x (p,)."""
         blocks = [parameter.differentiate_entries(own) for parameter, own in self._split_point(x)]
         return np.asarray(block_diag(*blocks))  # an entry depends on the coordinates of its own number alone
 
@@ -173,10 +191,10 @@ class Parameters:
         return list(zip(self.every, np.split(x, ends[:-1]), strict=True))
 
     def slopes(self, x: Float[np.ndarray, " p"]) -> Float[np.ndarray, "entries p"]:
-        """Return the derivatives (entries, p) of the entries, unconstrained, by the unconstrained coordinates x (p,).
+        """Return d t(v) / dx (entries, p) for each number v of the table, with t(v) its logarithm or logit.
 
-        An unconstrained entry is its logarithm or logit if its domain has ends. There are no warnings,
-        since a derivative may be infinite at an end.
+        Intervals of estimates are symmetric in t(v); without ends of the domain it is v itself. By the chain rule it is
+        t'(v) dv/dx. It may be infinite at an end of the domain, which gives no warning.
         """
         entries = zip(self.entries, self.entries_at(x), self.jacobian(x), strict=True)
         with np.errstate(all="ignore"):

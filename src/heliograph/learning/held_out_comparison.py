@@ -39,7 +39,7 @@ class PredictedRows:
 
 @readable
 class Comparison(NamedTuple):
-    """Test of whether a recording speaks for the first of two laws or for the second.
+    """Test of whether a recording speaks for the first of two laws, a and b, or for the second.
 
     Args:
         difference: mean of log p_a - log p_b per step, in nats.
@@ -64,7 +64,12 @@ class Comparison(NamedTuple):
 class PredictionBeforeAndAfter:
     """Filter on the held-out rows, with the numbers that the network began with and with those learned.
 
-    gain: of log-likelihood per row, with its test; None where fewer than 10 rows arrived.
+    Args:
+        node: node of the filter.
+        filter: its name.
+        before: its predictions with the numbers before learning.
+        after: its predictions with those learned.
+        gain: mean gain of log-likelihood per row, with its test; None where fewer than 10 rows arrived.
     """
 
     node: str
@@ -77,11 +82,12 @@ class PredictionBeforeAndAfter:
 @readable
 @dataclass(frozen=True)
 class HeldOutTransforms:
-    """Probability integral transforms of one node's held-out rows under the learned network.
+    """Probability integral transforms of one node's held-out rows: uniform on (0, 1) if the learned network is right.
 
-    by_law: whether laws of gains count in full, or as the filter's Gaussians.
-
-    Shapes: pit (rows, received).
+    Args:
+        node: the node.
+        pit: P(z < what came | earlier rows) of each number (rows, received), NaN where none came.
+        by_law: whether laws of gains count in full, or as the filter's Gaussians.
     """
 
     node: str
@@ -125,19 +131,28 @@ def transform_held_out(
     inputs: np.ndarray,
     cut: int,
 ) -> list[HeldOutTransforms]:
-    """Return the probability integral transforms of each node's rows from `cut` on.
+    """Return the probability integral transforms of each node's rows from `cut` on, P(z < what came | earlier rows).
 
-    By the laws of its gains and noise where known, else by the Gaussian predictions of its first filter (`outcome`).
-    `measurements`: by node (rows, received); `inputs`: (rows, inputs).
+    They are uniform on (0, 1) if the network is right. They come from the laws of its gains and noise where known, else
+    from the Gaussian predictions of its first filter.
+
+    Args:
+        network: the network with the numbers learned.
+        outcome: predictions of the rows from `cut` on, as `compare_before_and_after` returns them.
+        measurements: measurements by node (rows, received).
+        inputs: inputs of the plant (rows, inputs).
+        cut: number of the first row that was not learned from.
     """
     uniform = []
     for name, z in measurements.items():
-        of_node, node = [change for change in outcome if change.node == name], network.nodes[name]
+        node = network.nodes[name]
+        predicted_of_node = [prediction for prediction in outcome if prediction.node == name]
         by_law = _transform_by_laws(network, node, z, inputs) if isinstance(node, Node) else None
         if by_law is not None:
             uniform.append(HeldOutTransforms(name, by_law[cut:], by_law=True))
-        elif of_node:
-            uniform.append(HeldOutTransforms(name, np.asarray(ndtr(of_node[0].after.white)), by_law=False))
+        elif predicted_of_node:
+            white = predicted_of_node[0].after.white  # innovations in deviations, normal if the filter is right
+            uniform.append(HeldOutTransforms(name, np.asarray(ndtr(white)), by_law=False))
     return uniform
 
 
@@ -145,6 +160,12 @@ def _transform_by_laws(network: Network, node: Node, z: np.ndarray, inputs: np.n
     """Return P(z_k <= what came | earlier rows) of each measurement (rows, received), by laws of gain and noise.
 
     The result is None if these laws of the node vary over time, remember, or have no nodes to sum over.
+
+    Args:
+        network: the network, for its plant.
+        node: the node, for its sensor and channel.
+        z: measurements (rows, received), NaN where nothing arrived.
+        inputs: inputs of the plant (rows, inputs).
     """
     models = (network.plant, node.sensor, node.channel)
     if any(isinstance(model, OverTime) for model in models) or first(node.channel).remembers:

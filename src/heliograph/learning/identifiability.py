@@ -15,7 +15,7 @@ from heliograph.learning.long_run_covariance import student_quantile
 from heliograph.learning.parametric_network import Build, describe
 from heliograph.learning.told_numbers import find_told_filter
 from heliograph.learning.unidentified_directions import (
-    WEAK,
+    WEAK_INFORMATION,
     ConfoundedNumbers,
     InformationRank,
     find_confounded,
@@ -37,8 +37,9 @@ from heliograph.random_affine.moments.second_moments import second_order
 if TYPE_CHECKING:
     from heliograph.learning.estimate_table import Solution
 
-POINTS = 3
-AROUND = 0.5  # how far from the start, in each coordinate
+KINDS_OF_MOMENTS = ("mean gain", "gain variance", "noise")
+POINTS_NEAR_START = 3
+LARGEST_DISTANCE = 0.5  # how far from the start, in each coordinate
 
 
 @readable
@@ -106,7 +107,7 @@ def identifiable(network: Build, inputs: ArrayLike | None = None, horizon: int =
     description = describe(network)
     description.start.check_sends_each_step("identifiability")
     # The filter's likelihood as a function of the free numbers.
-    objective = make_objectives(description)[-1]
+    *_, objective = make_objectives(description)  # the last form, which is the sharpest
     count = len(description.start.inputs)
     if inputs is None and count:
         raise fail("inputs", f"an array (steps, {count}) of {list(description.start.inputs)}", "none")
@@ -126,6 +127,11 @@ def identify_by_recording(surface: LikelihoodSurface, start: Float[np.ndarray, "
 
     `late` is the information of the recording's second half, in which what is known before the first step counts least.
     Points where it is not finite are left out. If it is finite at none, only the start is judged.
+
+    Args:
+        surface: the likelihood of the recording.
+        start: unconstrained coordinates of the free numbers (p,).
+        seed: of the points.
     """
     points = _draw_points_near(start, seed)
     late = surface.evaluations(np.stack(points)).late
@@ -137,22 +143,30 @@ def identify_by_recording(surface: LikelihoodSurface, start: Float[np.ndarray, "
 
 
 def _draw_points_near(start: np.ndarray, seed: int) -> list[np.ndarray]:
-    """Return POINTS points (p,) drawn near a start (p,), at most AROUND away in each coordinate.
+    """Return three points (p,) drawn near a start (p,), at most LARGEST_DISTANCE (0.5) away in each coordinate.
 
-    Small coordinates are moved less.
+    At the start itself numbers may be identified by chance, or not be, as where two of them are equal. Small
+    coordinates are moved less.
     """
     rng = np.random.default_rng([seed, 1])
     reach = np.minimum(1.0, 0.2 + np.abs(start))
-    return [start + rng.uniform(-AROUND, AROUND, len(start)) * reach for _ in range(POINTS)]
+    return [
+        start + rng.uniform(-LARGEST_DISTANCE, LARGEST_DISTANCE, len(start)) * reach for _ in range(POINTS_NEAR_START)
+    ]
 
 
 def _judge_identifiability(
     parameters: Parameters, points: list[np.ndarray], ranks: list[InformationRank]
 ) -> Identifiability:
-    """Return what is identified, from the ranks of the information at several points (p,), with sentences on it.
+    """Return what is identified, from the ranks of the information at several points, with sentences on it.
 
-    `rank.flat`: directions, in columns, on which the data say nothing. `ridges`: their number at the point with fewest.
-    `rank.weakest`: the smallest information in any other direction; the largest over the points counts.
+    A point with more flat directions than another has them by chance, so the point with fewest counts.
+
+    Args:
+        parameters: the free numbers.
+        points: unconstrained coordinates of the points (p,).
+        ranks: at each point the flat directions (`flat`, in columns), on which the data say nothing, and the least
+            information in any other direction (`weakest`), of which the largest counts.
     """
     groups = tuple(find_confounded(parameters, points, ranks))
     ridges = min(rank.flat.shape[1] for rank in ranks)
@@ -164,7 +178,9 @@ def _judge_identifiability(
 def describe_unidentified(identifiability: Identifiability, solution: "Solution | None") -> tuple[str, ...]:
     """Return sentences on the numbers that are not identified, and on the products or sums of them that are.
 
-    `solution`: the maximum, whose estimates and intervals the sentences quote; None where there is none yet.
+    Args:
+        identifiability: which numbers, and which combinations of them, are identified.
+        solution: the maximum, whose estimates and intervals the sentences quote; None where there is none yet.
     """
     names = identifiability.parameters.coordinates
     lines = [
@@ -175,7 +191,7 @@ def describe_unidentified(identifiability: Identifiability, solution: "Solution 
     has_others = any(group.fix + len(group.exponents) < len(group.coordinates) for group in identifiability.groups)
     if solution is not None and has_others:
         lines += describe_identified_links(solution)
-    if identifiability.weakest < WEAK:
+    if identifiability.weakest < WEAK_INFORMATION:
         lines.append(
             f"The data hardly tell some of {', '.join(names)} apart (least eigenvalue {identifiability.weakest:.1g}): "
             "expect wide intervals."
@@ -186,10 +202,13 @@ def describe_unidentified(identifiability: Identifiability, solution: "Solution 
 def _describe_confounded_group(parameters: Parameters, group: ConfoundedNumbers, solution: "Solution | None") -> str:
     """Return one sentence on a group of confounded numbers: which sums or products of them the data do tell.
 
-    Confounded numbers are free numbers that the data do not tell apart. An example: "Of a and b only the product a * b
-    (0.48, 95 % 0.44..0.53) is identified; fix one." The interval needs a `solution`, the maximum of the likelihood.
-    `group` has the numbers' indices, how many must be fixed (`fix`), and the combinations that are identified:
-    `exponents` of products, `weights` of sums (combinations, numbers).
+    Confounded numbers are those that the data do not tell apart. An example: "Of a and b only the product a * b (0.48,
+    95 % 0.44..0.53) is identified; fix one."
+
+    Args:
+        parameters: the free numbers, with their names.
+        group: the numbers' indices, how many must be fixed, and the products and sums that are identified.
+        solution: the maximum of the likelihood; None where there is none yet.
     """
     names = [parameters.coordinates[i] for i in group.coordinates]
     if group.fix == len(names):  # no combination of them is identified
@@ -238,7 +257,8 @@ def _format_interval(
     if solution is None or not all(solution.active[i] for i in group.coordinates):
         return ""
     # The value sum_i a_i v_i, or sum_i a_i log |v_i|, and its slopes by the unconstrained coordinates.
-    jacobian, values = parameters.jacobian(solution.x), parameters.entries_at(solution.x)
+    jacobian = parameters.jacobian(solution.x)
+    values = parameters.entries_at(solution.x)
     slopes, value = np.zeros(len(solution.x)), 0.0
     for entry, slope, number in zip(parameters.entries, jacobian, values, strict=True):
         if entry.coordinate in group.coordinates:
@@ -259,10 +279,7 @@ def _join_names(names: list[str]) -> str:
 
 
 def _draw_measurements(objective: Objective, x: np.ndarray, u: np.ndarray, seed: int) -> Float[np.ndarray, "steps m"]:
-    """Return measurements (steps, received) drawn by the model of the filter at x (p,), with inputs u.
-
-    Each row is Gaussian given the earlier rows.
-    """
+    """Return measurements (steps, received) drawn by the model of the filter at x (p,) under inputs u, row by row."""
     with jax.enable_x64(True):
         return np.asarray(_draw_measurements_by_innovations(objective, x, u, jax.random.key(seed)))
 
@@ -280,9 +297,14 @@ def _draw_measurements_by_innovations(objective: Objective, x: Array, u: Array, 
     reporting = find_told_filter(filter)
 
     def draw_row(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, jax.Array]:
-        """Return the filter's state after row k, and the measurement drawn for it."""
+        """Return the filter's state after row k, and the measurement drawn for it.
+
+        `reporting` is the filter that reads numbers reported with messages, None if there are none; `key_of_numbers` is
+        the key that they are drawn with.
+        """
         k, u_k, noise = row
-        prior, zeros = filter.predict(state, u_k, k), jnp.zeros(filter.received)
+        prior = filter.predict(state, u_k, k)
+        zeros = jnp.zeros(filter.received)
         # Draw the reported numbers first: the law of the other components depends on them.
         numbers = jnp.zeros(0)
         if reporting is not None:
@@ -290,26 +312,22 @@ def _draw_measurements_by_innovations(objective: Objective, x: Array, u: Array, 
             zeros = reporting.with_numbers(zeros, numbers)
         # The innovation of z = 0 is -E z, with covariance S. Both are NaN for reported numbers, which get S = I and are
         # overwritten below.
-        received = filter.correct(prior, zeros, k)[1]
-        is_value = ~jnp.isnan(received.value)
-        S = jnp.where(is_value[:, None] & is_value, received.covariance, jnp.eye(len(zeros)))
+        _, innovation = filter.correct(prior, zeros, k)
+        is_value = ~jnp.isnan(innovation.value)
+        S = jnp.where(is_value[:, None] & is_value, innovation.covariance, jnp.eye(len(zeros)))
         # z = E z + L noise, with L L' = S.
-        z = cholesky(S) @ noise - received.value
+        z = cholesky(S) @ noise - innovation.value
         if reporting is not None:
             z = reporting.with_numbers(z, numbers)
-        return filter.correct(prior, z, k)[0], z
+        after, _ = filter.correct(prior, z, k)
+        return after, z
 
     start = jax.tree.map(jnp.asarray, filter.init())
     key_of_numbers = jax.random.fold_in(key, 1)
     noise = jax.random.normal(key, (len(u), filter.received), dtype=float)
-    measurements: jax.Array = jax.lax.scan(draw_row, start, (jnp.arange(len(u)), jnp.asarray(u), noise))[1]
+    measurements: jax.Array
+    _, measurements = jax.lax.scan(draw_row, start, (jnp.arange(len(u)), jnp.asarray(u), noise))
     return measurements
-
-
-if TYPE_CHECKING:
-    from heliograph.learning.estimate_table import Solution
-
-KINDS = ("mean gain", "gain variance", "noise")
 
 
 def describe_identified_links(solution: "Solution") -> list[str]:
@@ -320,8 +338,7 @@ def describe_identified_links(solution: "Solution") -> list[str]:
     sensor or channel varies over time, or depends on inputs or the past.
 
     Args:
-        solution: the maximum of the likelihood, with the point x, the covariance of its active coordinates (not at an
-            end of their domain), and the network as a function of x.
+        solution: the maximum of the likelihood, at the point x, with the covariance of its active coordinates.
     """
     # The sensor and channel of all nodes together, at the starting point, to see of what kind they are.
     description = solution.surface.objective.description
@@ -330,7 +347,10 @@ def describe_identified_links(solution: "Solution") -> list[str]:
         return []
 
     def compute_moments_at(x: Array) -> jax.Array:
-        """Return mean gain, gain variance and noise of each output (outputs, 3) at unconstrained coordinates x."""
+        """Return mean gain, gain variance and noise of each output (outputs, 3) at unconstrained coordinates x.
+
+        `description` builds the network from the free numbers.
+        """
         _, sensor, channel = join_all_nodes(description.at(description.parameters.values(x)))
         return _compute_link_moments(first(sensor), first(channel))
 
@@ -348,7 +368,7 @@ def describe_identified_links(solution: "Solution") -> list[str]:
     lines = []
     for name, values, gradients in zip(names, moments, slopes, strict=True):
         found = []
-        for kind, value, gradient in zip(KINDS, values, gradients, strict=True):
+        for kind, value, gradient in zip(KINDS_OF_MOMENTS, values, gradients, strict=True):
             if solution.identifies(gradient):
                 reach = student_quantile(freedom) * float(np.sqrt(max(gradient @ covariance @ gradient, 0.0)))
                 found.append(f"{kind} {value:.3g} ({value - reach:.3g} .. {value + reach:.3g})")

@@ -9,16 +9,20 @@ from heliograph.numerics.types import Bool, Float
 
 
 def estimate_long_run_deviation(values: Float[np.ndarray, " steps"]) -> float:
-    """Return sqrt(Var(sum of T values) / T) of a series (steps,), correlated over time, by Bartlett's weights."""
+    """Return sqrt(Var(sum of T values) / T) of a series (steps,) that is correlated over time.
+
+    This long-run deviation over sqrt(T) is the standard error of the mean. It is estimated by Bartlett's weights.
+    """
     total = estimate_by_bartlett([values[:, None] - values.mean()]).covariance
     return float(np.sqrt(max(total[0, 0], 0.0) / len(values)))
 
 
 def estimate_mean_and_error(values: Float[np.ndarray, " steps"]) -> tuple[float, float]:
-    """Return the mean of a series (steps,), and its standard error, which is NaN of one value.
+    """Return the mean of a series (steps,) that is correlated over time, and its standard error (NaN of one value).
 
-    Deviations from the mean of the series itself are too small: of n independent ones the long-run variance is
-    n - 1' W 1 / n of n parts, W being Bartlett's weights over L lags; this is made good.
+    Deviations from the mean of the series itself are too small. Of n independent values, the variance that they give
+    the sum is too small by the factor (n - 1' W 1 / n) / n, with W the matrix of Bartlett's weights and 1 the vector of
+    ones; so it is divided by that.
     """
     n = len(values)
     if n < 2:
@@ -30,21 +34,26 @@ def estimate_mean_and_error(values: Float[np.ndarray, " steps"]) -> tuple[float,
 Method = Literal["cosines", "bartlett", "white", "hessian", "bootstrap", "profile"]
 METHODS = get_args(Method)
 LEVEL = 0.95
-DRAWS = 999  # of the bootstrap
-FEW = 1 / 3  # share of the data in which the information on a number lies, below which scores do not tell its spread
+BOOTSTRAP_DRAWS = 999  # of the bootstrap
+# Share of the data in which the information on a number lies, below which scores do not tell its spread.
+FEW_STRETCHES = 1 / 3
 
 Scores = list[Float[np.ndarray, "steps p"]]
 
 
 class LongRunCovariance(NamedTuple):
-    """Covariance of the sum of scores, and the degrees of freedom with which it is known."""
+    """Covariance of the sum of scores, and the degrees of freedom with which it is known.
+
+    A score is the gradient of a row's log-likelihood by p numbers. Intervals of estimates take their quantile from
+    Student's law with this freedom.
+    """
 
     covariance: Float[np.ndarray, "p p"]
     freedom: float
 
 
 def count_cosines(steps: int) -> int:
-    """Return the number of cosines by which the scores of so many steps are judged, nu = floor(0.4 T^(2/3))."""
+    """Return nu = floor(0.4 T^(2/3)), the number of cosines that estimate the covariance of the scores of T steps."""
     return max(int(0.4 * steps ** (2 / 3)), 1)
 
 
@@ -53,9 +62,9 @@ def find_numbers_in_few_stretches(information: list[Float[np.ndarray, "steps k"]
 
     Stretches divide the rows evenly, as many as cosines are used to estimate the covariance of summed scores. With V_b
     the information in stretch b, (sum_b V_b)^2 / sum_b V_b^2 is nu if all V_b are equal, and 1 if all but one are 0.
-    Below FEW nu the stretches are few. Scores of such a number differ from 0 only there, where cosines hardly change,
-    so that the cosines' estimate misses their variance.
-    `information`: for each recording, the information of each row on each number (steps, k).
+    Below FEW_STRETCHES nu the stretches are few. Scores of such a number differ from 0 only there, where cosines hardly
+    change, so that the cosines' estimate misses their variance. `information`: for each recording, the information of
+    each row on each number (steps, k).
     """
     by_recording = []
     for rows in information:
@@ -63,7 +72,7 @@ def find_numbers_in_few_stretches(information: list[Float[np.ndarray, "steps k"]
         begins = np.arange(count) * len(rows) // count
         by_recording.append(np.add.reduceat(rows, begins, axis=0))  # sums over each stretch
     stretches = np.maximum(np.concatenate(by_recording), 0.0)  # V, (stretches, k)
-    return np.asarray(stretches.sum(axis=0) ** 2 < FEW * len(stretches) * np.sum(stretches**2, axis=0))
+    return np.asarray(stretches.sum(axis=0) ** 2 < FEW_STRETCHES * len(stretches) * np.sum(stretches**2, axis=0))
 
 
 def remove_predicted_scores(
@@ -75,10 +84,9 @@ def remove_predicted_scores(
     log-likelihood and K the numbers marked in `in_few_stretches`. If the model is true, both parts are uncorrelated,
     and the covariances of their sums add up to H.
     """
-    coefficients = np.linalg.solve(
-        hessian[np.ix_(in_few_stretches, in_few_stretches)], hessian[in_few_stretches]
-    )  # (few, p)
-    return [s - s[:, in_few_stretches] @ coefficients for s in scores], hessian[:, in_few_stretches] @ coefficients
+    K = in_few_stretches
+    coefficients = np.linalg.solve(hessian[np.ix_(K, K)], hessian[K])  # H_KK^-1 H_K. (few, p)
+    return [s - s[:, K] @ coefficients for s in scores], hessian[:, K] @ coefficients
 
 
 def estimate_by_cosines(scores: Scores) -> LongRunCovariance:
@@ -120,14 +128,19 @@ def estimate_by_bartlett(scores: Scores) -> LongRunCovariance:
 
 def estimate_if_white(scores: Scores) -> LongRunCovariance:
     """Return the covariance of the sum of scores, sum_t s_t s_t', taken for uncorrelated over time (white)."""
-    return LongRunCovariance(np.sum([s.T @ s for s in scores], axis=0), freedom=np.inf)
+    return LongRunCovariance(np.sum([s.T @ s for s in scores], axis=0), freedom=np.inf)  # s: (steps, p)
 
 
 def bootstrap_block_sums(scores: Scores, draws: int, seed: int) -> Float[np.ndarray, "draws p"]:
-    """Return sums of scores over randomly drawn blocks of 2 T^(1/3) steps, minus their mean, (draws, p).
+    """Return draws of the sum of scores, minus their mean, by a bootstrap of blocks of rows (draws, p).
 
-    From each series of T steps, blocks of about T steps in total are drawn with replacement. The sums of all series are
-    added.
+    Rows are correlated over time, so blocks of 2 T^(1/3) successive ones are drawn with replacement from each series of
+    T steps, until they have about T steps in total. The sums of all series are added.
+
+    Args:
+        scores: gradients of each row's log-likelihood, (steps, p) for each series.
+        draws: number of draws.
+        seed: of the random numbers.
 
     Source: Künsch (1989) for blocks; Hu and Kalbfleisch (2000) for drawing scores in place of data.
     """
@@ -150,11 +163,16 @@ def estimate_long_run_covariance(
 ) -> LongRunCovariance:
     """Return the covariance of the sum of scores by a method of `Fit.rows`, with its degrees of freedom.
 
-    Of "hessian" and "profile" it is the Hessian of -l, as in a right model.
+    If the model is right, it is the Hessian of -l, l being the log-likelihood: "hessian" and "profile" take that.
+
+    Args:
+        method: how intervals are computed.
+        scores: gradients of each row's log-likelihood, (steps, p) for each recording.
+        hessian: Hessian of -l (p, p).
     """
     match method:
         case "bootstrap":
-            sums = bootstrap_block_sums(scores, DRAWS, 0)
+            sums = bootstrap_block_sums(scores, BOOTSTRAP_DRAWS, 0)
             return LongRunCovariance(np.atleast_2d(np.cov(sums.T)), freedom=np.inf)
         case "cosines":
             return estimate_by_cosines(scores)
@@ -172,13 +190,20 @@ def student_quantile(freedom: float, level: float = LEVEL) -> float:
 
 
 def find_profile_drop(level: float) -> float:
-    """Return by how many nats a profile likelihood is lower at the ends of an interval: half a chi-square quantile."""
+    """Return by how many nats the profile log-likelihood at the ends of an interval is below its maximum.
+
+    Twice this fall is chi-square with one degree of freedom, so it is half the quantile at `level`.
+    """
     return float(scipy.stats.chi2.ppf(level, 1)) / 2
 
 
 def compute_sandwich_covariance(
     hessian: Float[np.ndarray, "p p"], scores: Float[np.ndarray, "p p"]
 ) -> Float[np.ndarray, "p p"]:
-    """Return the covariance H^-1 J H^-1 of estimates: H the Hessian of -l, J that of summed scores (`scores`)."""
-    half = np.linalg.solve(hessian, scores)
+    """Return the covariance H^-1 J H^-1 of estimates, with H the Hessian of -l (`hessian`).
+
+    J (`scores`) is the covariance of the sum of scores, the gradients of the log-likelihood l by row. If the model is
+    right J = H, and this is H^-1.
+    """
+    half = np.linalg.solve(hessian, scores)  # H^-1 J, and as J is symmetric its transpose is J H^-1
     return np.asarray(np.linalg.solve(hessian, half.T))

@@ -23,7 +23,8 @@ from heliograph.simulation.network import Network
 Kind = Literal["real", "positive", "probability", "simplex", "covariance"]
 Build = TypeAliasType("Build", Callable[[], Network])  # a function that returns a network
 
-ASIDE, IRRATIONAL = 0.1, 0.6180339887498949  # unconstrained distance of a point near the start; multiples of it differ
+DISTANCE_FROM_START = 0.1  # unconstrained distance of a point near the start
+IRRATIONAL = 0.6180339887498949  # fractions of its multiples are all different
 
 DOMAINS: dict[Kind, Domain] = {
     "real": REAL,
@@ -76,9 +77,9 @@ _reader: ContextVar[_FreeNumberReader | None] = ContextVar("reader of free numbe
 
 @contextmanager
 def answer_free_marks_by(reader: _FreeNumberReader) -> Iterator[None]:
-    """Let `reader` answer all calls of `free` inside the `with` block.
+    """Let `reader` answer all calls of `hg.free` inside the `with` block: its answer stands in the number's place.
 
-    `_reader`: the context variable in which `free` finds who answers it.
+    `hg.free` finds it in the context variable `_reader`, which is set back afterwards.
     """
     token = _reader.set(reader)
     try:
@@ -91,22 +92,31 @@ class _MarkedNumber:
     """A free number while it is being collected: its start, name, and the domain that its places leave it."""
 
     def __init__(self, start: np.ndarray, name: str | None, kind: Kind | None):
-        """Store the start, the name (`given`, None without one) and the domain that the kind means.
+        """Store what the user said of the number; its places are told later by `report`.
 
-        `explicit`: True if the user gave the kind, so that the place does not narrow the domain. `place`: where the
-        number stands; `report` sets it.
+        Args:
+            start: value from which a search begins.
+            name: its name, or None if the user gave none.
+            kind: its kind if the user gave one, which decides its domain; else its places do.
         """
-        self.start, self.given, self.place = start, name, ""
+        self.start = start
+        self.given = name
+        self.place = ""  # name of the argument in which it stands, from its first report on
         self.domain = None if kind is None else DOMAINS[kind]
         self.explicit = kind is not None
 
     def report(self, name: str, domain: Domain) -> None:
         """Note the number's place, and narrow its domain to what the check at this place requires.
 
-        A kind that the user gave stays. Two intervals are intersected. A check that requires nothing (REAL) changes
-        nothing. Any other domain replaces the known one.
+        A number may stand in several places, such as one variance in two sensors. A kind that the user gave stays. Two
+        intervals are intersected. A check that requires nothing (REAL) changes nothing. Any other domain replaces the
+        known one.
+
+        Args:
+            name: name of the argument in whose place the number stands.
+            domain: values that are allowed there.
         """
-        self.place = self.place or name
+        self.place = self.place or name  # the first place gives the name
         if self.explicit:
             return
         known = REAL if self.domain is None else self.domain
@@ -128,7 +138,12 @@ class FreeNumberCollector:
         """Return the start of a number marked `hg.free`, wrapped so that the check of its argument reports its domain.
 
         A checked argument (a variance, a probability) knows which values are allowed: that becomes the number's domain.
-        `self.marks`: the numbers met so far. The same name is the same number again, and must have the same start.
+        A name met before means the same number in another place, which must have the same start.
+
+        Args:
+            start: the number's start.
+            name: its name, or None.
+            kind: its kind, or None if its place decides.
         """
         for mark in self.marks:
             if name is not None and mark.given == name:
@@ -140,7 +155,10 @@ class FreeNumberCollector:
         return mark_checked(start, self.marks[-1].report)
 
     def parameters(self) -> Parameters:
-        """Return all marked free numbers as parameters; a number without a name is named after its place."""
+        """Return all marked free numbers as parameters; a number without a name is named after its place.
+
+        A number without a domain, whose place requires nothing, may be any real number.
+        """
         taken = {mark.given for mark in self.marks if mark.given is not None}
         results = []
         for mark in self.marks:
@@ -156,7 +174,7 @@ class ValueReader:
     """Reader that puts values in their places: by name, and in the order of the marks where no name was given."""
 
     def __init__(self, parameters: Parameters, named: tuple[bool, ...], values: Mapping[str, object]):
-        """Store values by the names of parameters, and the names that the user did not give, in their order.
+        """Store the values, and the names of the numbers that the user did not name, in the order of their marks.
 
         Args:
             parameters: all free numbers, in the order of their places.
@@ -167,10 +185,10 @@ class ValueReader:
         self.unnamed = iter([p.name for p, is_named in zip(parameters.every, named, strict=True) if not is_named])
 
     def answer_free(self, start: np.ndarray, name: str | None, kind: Kind | None) -> object:
-        """Return the value of this name, or of the next number without a name.
+        """Return the value of the number with this name, or if it is None, of the next number that has no name.
 
-        `self.unnamed`: iterates over the names given to numbers without one, in the order in which the function marks
-        them.
+        The function that builds the network marks its numbers in the same order each time, so that the next one without
+        a name is known. `start` and `kind` are not used.
         """
         key = next(self.unnamed, "") if name is None else name
         if key not in self.values:
@@ -217,7 +235,7 @@ class Description:
 
     @cached_property
     def start(self) -> Network:
-        """Network with every free number at its start."""
+        """Network with every free number at its start, as plain numbers."""
         return self.at({parameter.name: to_plain_number(parameter.start) for parameter in self.parameters.every})
 
     @cached_property
@@ -228,7 +246,8 @@ class Description:
         either side of the start, it is the network at the start.
         """
         start = self.parameters.start
-        away = ASIDE * (1 + np.modf(IRRATIONAL * np.arange(1, len(start) + 1))[0])  # different for each number
+        fractions, _ = np.modf(IRRATIONAL * np.arange(1, len(start) + 1))  # different for each number
+        away = DISTANCE_FROM_START * (1 + fractions)
         for direction in (1.0, -1.0):
             with suppress(ValueError):
                 return self.at_point(start + direction * away)

@@ -10,6 +10,7 @@ from heliograph.filters.gaussian.gaussian_prediction import open_loop_filter
 from heliograph.learning.likelihood.predictive_density import (
     NODES,
     ChannelDensities,
+    ExpectedSignals,
     evaluate_predictive,
     make_signal_filter,
 )
@@ -30,9 +31,11 @@ HORIZON, RUNS = 500, 32  # steps and runs that are simulated under each law
 class SamplesToTell(NamedTuple):
     """Number of steps that the likelihood ratio needs to decide between two laws, and what it gains in each.
 
-    samples: steps after which both errors are at most `error`; infinite where the laws look alike. information: mean
-    of log p_true - log p_other per step where the first law is true, and where the second is, nats. deviation: of the
-    sum of these over n steps, over sqrt(n), for many steps.
+    Args:
+        samples: steps after which both errors are at most `error`; infinite where the laws look alike.
+        information: mean of log p_true - log p_other per step, in nats, where the first law is true and where the
+            second is.
+        deviation: standard deviation of the sum of these over n steps, over sqrt(n), for many steps.
     """
 
     samples: float
@@ -81,13 +84,15 @@ def samples_to_tell(
     u = np.zeros((steps, len(network.inputs))) if inputs is None else np.asarray(inputs, dtype=float)
     # Mean I and long-run deviation sqrt V of the log-likelihood ratio per step, where either law is true.
     channels = [_replace_law(node.channel, (law_a, law_b), law) for law in (law_a, law_b)]
-    means, deviations = list[float](), list[float]()
+    means = list[float]()
+    deviations = list[float]()
     any_filter = {"open_loop": open_loop_filter(network.plant)}  # of the runs only the measurements are used
     for true, other in (channels, channels[::-1]):
+        # Measurements z (runs, steps, received) under the true law, and log p_true - log p_other of each (runs, steps).
         world = Network(network.plant, {name: Node(node.sensor, true, any_filter)})
         z = monte_carlo(world, steps, RUNS, seed, inputs=inputs).measurements[name]
         of_true, of_other = (_predict_densities(network, node, channel, z, u, nodes) for channel in (true, other))
-        log_ratio = np.asarray(of_true - of_other)  # (runs, steps)
+        log_ratio = np.asarray(of_true - of_other)
         means.append(float(log_ratio.mean()))
         deviations.append(float(np.sqrt(np.mean([estimate_long_run_deviation(run) ** 2 for run in log_ratio]))))
     # n = (z (sqrt V_a + sqrt V_b) / (I_a + I_b))^2, with the normal quantile z that is exceeded with probability
@@ -132,6 +137,7 @@ def _replace_law(channel: object, pair: tuple[AbstractLaw, AbstractLaw], law: Ab
     replaced = of_pair or like_first
 
     def replace_if_chosen(leaf: object) -> object:
+        """Return the new law in place of a gain in question, and anything else as it is."""
         return law if any(leaf is gain for gain in replaced) else leaf
 
     changed: AbstractRandomAffine = jax.tree.map(replace_if_chosen, single, is_leaf=_is_law)
@@ -156,9 +162,11 @@ def _predict_densities(
         u: inputs of the plant (steps, inputs).
         nodes: number of values that stand for the law.
     """
+    # The channel given that something arrives, since losses say nothing of the gains.
     received = channel.condition_on_arrival()
-    filter, parts = make_signal_filter(network.plant, node.sensor, received), ChannelDensities.of(received, nodes)
+    filter = make_signal_filter(network.plant, node.sensor, received)
+    parts = ChannelDensities.of(received, nodes)
     # Mean and covariance of the expected signal, and the measurement, with all steps of all runs in one axis.
-    expected = filter.expect_signals(z, u)
-    y, covariance, measured = (np.asarray(array).reshape(-1, *array.shape[2:]) for array in expected)
-    return evaluate_predictive((y, covariance, measured), parts).log_likelihood.reshape(z.shape[:2])
+    by_run = filter.expect_signals(z, u)
+    expected = ExpectedSignals(*(np.asarray(array).reshape(-1, *array.shape[2:]) for array in by_run))
+    return evaluate_predictive(expected, parts).log_likelihood.reshape(z.shape[:2])

@@ -21,17 +21,17 @@ from heliograph.simulation.likelihood import log_likelihood
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 
-IMPOSSIBLE = -1e300  # log-likelihood of impossible recordings: a search needs a number
+IMPOSSIBLE_LIKELIHOOD = -1e300  # log-likelihood of impossible recordings: a search needs a number
 FIRST_REACH = 0.05  # from the maximum towards an end of an interval, in unconstrained coordinates
 LARGEST_SIMPLEX = 0.2  # edges of a first simplex, in unconstrained coordinates
 MOST_EVALUATIONS = 200  # of a search, for each coordinate
-NORMAL = 1.96  # deviations of a normal law on either side, between which 95 % lie
-FURTHEST = (
+NORMAL_QUANTILE = 1.96  # deviations of a normal law on either side, between which 95 % lie
+FURTHEST_END = (
     4.0  # in unconstrained coordinates, in logarithms and logits: an interval that reaches so far has no end there
 )
-HALVINGS = 12
-DIGITS = 1e-4  # of an unconstrained coordinate
-NEAR = 1e-3  # of the ends of an interval, and of what is searched for them
+BISECTIONS = 12
+SIMPLEX_ACCURACY = 1e-4  # of an unconstrained coordinate
+END_ACCURACY = 1e-3  # of the ends of an interval, and of what is searched for them
 
 Likelihood = Callable[[Float[np.ndarray, " p"]], float]
 
@@ -145,21 +145,38 @@ def fit_sender(
     def likelihood(x: Float[np.ndarray, " p"]) -> float:
         """Return the log-likelihood of all recordings at unconstrained coordinates x (p,).
 
-        `data`: recordings side by side; the first `lengths` rows of each count. IMPOSSIBLE: a very low number that
-        replaces -inf and NaN, since the search needs numbers.
+        `data`: recordings side by side; the first `lengths` rows of each count. IMPOSSIBLE_LIKELIHOOD: a very low
+        number that replaces -inf and NaN, since the search needs numbers. `description` builds the network from the
+        free numbers.
         """
         filter = make_event_filter(description.at_point(x))
         recordings = zip(data.measurements, data.inputs, data.lengths, strict=True)
         total = sum(float(log_likelihood(filter, z[:steps], u[:steps])) for z, u, steps in recordings)
-        return total if np.isfinite(total) else IMPOSSIBLE
+        return total if np.isfinite(total) else IMPOSSIBLE_LIKELIHOOD
 
     # The maximum: from the start, and from others drawn within one unit of each logarithm or logit.
     random = np.random.default_rng(seed)
     points = [parameters.start, *(parameters.start + random.uniform(-1, 1, (starts - 1, len(parameters.start))))]
     top = _search_from_starts(likelihood, points, say)
-    # An interval for each number, as far as Ctrl-C lets the search come.
+    rows, stopped = _make_rows(description, likelihood, top, say)
+    return SenderFit(description, top.x, top.total, tuple(rows), top.converged, stopped)
+
+
+def _make_rows(
+    description: Description, likelihood: Likelihood, top: "_BestPoint", say: Callable[[str], None]
+) -> tuple[list[Row], bool]:
+    """Return a row with an interval for each number of the table, and whether the search was stopped.
+
+    After Ctrl-C, rows have no intervals.
+
+    Args:
+        description: the network with its free numbers.
+        likelihood: log-likelihood at a point in unconstrained coordinates.
+        top: the maximum.
+        say: called with a line of text at each interval.
+    """
     rows, stopped = list[Row](), top.stopped
-    for i, entry in enumerate(parameters.entries):
+    for i, entry in enumerate(description.parameters.entries):
         say(f"interval of {entry.name}")
         row = _make_row_without_interval(description, top.x, i)
         try:
@@ -167,7 +184,7 @@ def fit_sender(
         except KeyboardInterrupt:
             stopped = True
             rows.append(row)
-    return SenderFit(description, top.x, top.total, tuple(rows), top.converged, stopped)
+    return rows, stopped
 
 
 def _search_from_starts(
@@ -190,7 +207,7 @@ def _search_from_starts(
     def evaluate(x: Float[np.ndarray, " p"]) -> float:
         """Return the log-likelihood at a point, and keep the best point so far in `best`.
 
-        It is kept as not converged, to be returned if the search is stopped.
+        It is kept as not converged, to be returned if the search is stopped. `x`: the point (p,).
         """
         nonlocal best
         total = likelihood(x)
@@ -211,7 +228,13 @@ def _search_from_starts(
 
 
 def make_event_filter(network: Network) -> AbstractFilter:
-    """Return the event filter of the network's only node; its likelihood is maximised in a fit."""
+    """Return the event filter of the network's only node; its likelihood is maximised in a fit.
+
+    An event filter also uses that nothing came: the sender then decided not to send, or the packet was lost.
+
+    Raises:
+        ValueError: a node without a trigger, whose sender sends in each step.
+    """
     (node,) = network.nodes.values()
     if not isinstance(node, Node) or node.trigger is None:
         raise fail("node to be learned", "one whose sender decides", type(node).__name__)
@@ -223,7 +246,7 @@ def _climb_simplex(
     start: Float[np.ndarray, " p"],
     enough: float = np.inf,
     size: float = LARGEST_SIMPLEX,
-    digits: float = DIGITS,
+    digits: float = SIMPLEX_ACCURACY,
 ) -> "_BestPoint":
     """Return the best point of a search by Nelder and Mead from `start`.
 
@@ -245,18 +268,26 @@ def _climb_simplex(
     climb: Any = minimize  # its types do not know an initial simplex
 
     def stop_above_enough(intermediate_result: Any) -> None:
+        """Stop the search once its best point is above `enough`: SciPy calls this after each step."""
         if -intermediate_result.fun > enough:
             raise StopIteration
 
     def negative_likelihood(x: Float[np.ndarray, " p"]) -> float:
-        return -at_start if np.array_equal(x, start) else -likelihood(x)  # at the start it is known already
+        """Return minus the log-likelihood, which is minimised; at the start it is known already."""
+        return -at_start if np.array_equal(x, start) else -likelihood(x)
 
     optimum = climb(negative_likelihood, start, method="Nelder-Mead", options=options, callback=stop_above_enough)
     return _BestPoint(np.asarray(optimum.x), -float(optimum.fun), converged=bool(optimum.success), stopped=False)
 
 
 def _make_row_without_interval(description: Description, x: Float[np.ndarray, " p"], index: int) -> Row:
-    """Return the table's row for free number `index` at the maximum x (p,), without interval and standard error."""
+    """Return the table's row for free number `index` at the maximum x (p,), without interval and standard error.
+
+    Args:
+        description: the network with its free numbers.
+        x: unconstrained coordinates of the maximum (p,).
+        index: number of the entry of the table.
+    """
     return Row(
         name=description.parameters.entries[index].name,
         estimate=float(description.parameters.entries_at(x)[index]),
@@ -273,7 +304,7 @@ def _add_interval(row: Row, description: Description, likelihood: Likelihood, to
     """Return the row of an estimate with its interval, and a standard error that fits the interval's width.
 
     The profile is the log-likelihood maximised over all other coordinates. The interval ends where the profile has
-    fallen to a level. NORMAL: a 95 % interval reaches 1.96 standard errors to either side.
+    fallen to a level. NORMAL_QUANTILE: a 95 % interval reaches 1.96 standard errors to either side.
 
     Args:
         row: the row without an interval.
@@ -292,7 +323,7 @@ def _add_interval(row: Row, description: Description, likelihood: Likelihood, to
         point[coordinate] += side * profile.find_distance_to_level(top.x, side)
         ends.append(float(description.parameters.entries_at(point)[index]))
     low, high = sorted(ends)
-    return row._replace(low=low, high=high, standard_error=(high - low) / (2 * NORMAL))
+    return row._replace(low=low, high=high, standard_error=(high - low) / (2 * NORMAL_QUANTILE))
 
 
 class _BestPoint(NamedTuple):
@@ -312,9 +343,12 @@ class _ProfilePoint(NamedTuple):
 
 
 class _Profile(NamedTuple):
-    """Profile of a coordinate: the log-likelihood, largest over all other coordinates, by its value.
+    """Profile of one coordinate of the free numbers: its value against the log-likelihood, largest over all others.
 
-    level: log-likelihood down to which a value belongs to the interval of the coordinate.
+    Args:
+        likelihood: log-likelihood at a point in unconstrained coordinates (p,).
+        coordinate: index of the coordinate.
+        level: log-likelihood down to which a value belongs to the interval of the coordinate.
     """
 
     likelihood: Likelihood
@@ -322,22 +356,25 @@ class _Profile(NamedTuple):
     level: float
 
     def find_distance_to_level(self, top: Float[np.ndarray, " p"], side: float) -> float:
-        """Return how far from the maximum `top` the profile falls to the level, to one side (-1.0 or 1.0).
+        """Return how far from the maximum `top` (p,) the profile falls to the level, to one side (-1.0 or 1.0).
 
-        Twice as far each time until the profile is below it, then by bisection.
+        The distance is doubled until the profile is below the level, or beyond FURTHEST_END, where an interval counts
+        as without an end; then it is found by bisection, to END_ACCURACY.
         """
-        inside, outside = 0.0, FIRST_REACH
+        # distances at which the profile is above and below the level
+        inside = 0.0
+        outside = FIRST_REACH
         nearby = _ProfilePoint(top[self.coordinate], np.delete(top, self.coordinate))
-        while outside < FURTHEST:
+        while outside < FURTHEST_END:
             is_above, nearby = self.is_above_level(top[self.coordinate] + side * outside, nearby)
             if not is_above:
                 break
             inside, outside = outside, 2 * outside
-        for _ in range(HALVINGS):
+        for _ in range(BISECTIONS):
             middle = (inside + outside) / 2
             is_above, nearby = self.is_above_level(top[self.coordinate] + side * middle, nearby)
             inside, outside = (middle, outside) if is_above else (inside, middle)
-            if outside - inside < NEAR:
+            if outside - inside < END_ACCURACY:
                 break
         return outside
 
@@ -345,15 +382,19 @@ class _Profile(NamedTuple):
         """Return whether the profile at `value` is above the level, and its point there, searched from a nearby one.
 
         The profile is the log-likelihood with this coordinate held at `value`, maximised over the others. The search
-        stops as soon as it is above `self.level`. Its first simplex is as large as the two values are apart, up to
-        LARGEST_SIMPLEX. NEAR: accuracy in unconstrained coordinates.
+        stops as soon as it is above `self.level`, since only that is asked. Its first simplex is as large as the two
+        values are apart, up to LARGEST_SIMPLEX.
+
+        Args:
+            value: value of the coordinate.
+            nearby: another point of the profile, whose other coordinates begin the search.
         """
-        size = float(np.clip(abs(value - nearby.value), 10 * NEAR, LARGEST_SIMPLEX))
+        size = float(np.clip(abs(value - nearby.value), 10 * END_ACCURACY, LARGEST_SIMPLEX))
         best = _climb_simplex(
             lambda others: self.likelihood(np.insert(others, self.coordinate, value)),
             nearby.others,
             enough=self.level,
             size=size,
-            digits=NEAR,
+            digits=END_ACCURACY,
         )
         return best.total > self.level, _ProfilePoint(value, best.x)

@@ -1,4 +1,4 @@
-"""Filters of messages that tell numbers of their link, as rooms of design see them."""
+"""Filters of messages that report numbers of their link, such as its gain, as learning and design see them."""
 
 from typing import Protocol, runtime_checkable
 

@@ -8,21 +8,24 @@ from scipy.sparse.csgraph import connected_components
 from heliograph.learning.free_parameters import Parameters
 from heliograph.numerics.types import Float
 
-SPANNED = 1e-12  # share of the largest singular value above which a direction is spanned
-NOTHING, WEAK = 1e-8, 1e-4  # eigenvalues of the information in units of each coordinate's own
-SAME = 1e-5  # of a direction at several points
-WHOLE = 1e-4  # how far an exponent may be from a whole number
-LARGEST = 4  # exponent that is put in words
+LEAST_SINGULAR_VALUE = 1e-12  # share of the largest singular value above which a direction is spanned
+NO_INFORMATION, WEAK_INFORMATION = 1e-8, 1e-4  # eigenvalues of the information in units of each coordinate's own
+ROUNDING_OF_DIRECTIONS = 1e-5  # of a direction at several points
+ROUNDING_OF_EXPONENTS = 1e-4  # how far an exponent may be from a whole number
+LARGEST_EXPONENT = 4  # exponent that is put in words
 
 
 class ConfoundedNumbers(NamedTuple):
-    """Free numbers of which the data identify fewer combinations than there are numbers.
+    """Free numbers v_i of which the data identify fewer combinations than there are numbers.
 
-    coordinates: coordinates of the numbers. exponents: rows e of identified products prod_i v_i^e_i; weights: rows w of
-    identified sums sum_i w_i v_i where no product is; what is identified besides is neither. fix: how many numbers have
-    to be known from elsewhere.
+    For instance the data may tell the product a b of two gains, but neither of them: exponents [[1, 1]], fix 1.
 
-    Shapes: exponents, weights (combinations, numbers).
+    Args:
+        coordinates: indices of the numbers' coordinates.
+        exponents: rows e of identified products prod_i v_i^e_i (combinations, numbers).
+        weights: rows w of identified sums sum_i w_i v_i, where no product is (combinations, numbers). What is
+            identified besides is neither product nor sum.
+        fix: how many of the numbers have to be known from elsewhere.
     """
 
     coordinates: tuple[int, ...]
@@ -32,11 +35,13 @@ class ConfoundedNumbers(NamedTuple):
 
 
 class InformationRank(NamedTuple):
-    """Rank of the information at a point: directions of which nothing is known, and those of which something is.
+    """Information I (p, p) at a point, split in directions along which it is 0, and those in which something is known.
 
-    flat, rest: orthonormal directions of either kind, in columns, in units of each coordinate. unit: that unit,
-    1 / sqrt(I_ii). weakest: the least eigenvalue along `rest`.
-    Shapes: flat (p, k), rest (p, p - k), unit (p,).
+    Args:
+        flat: orthonormal directions without information, in columns (p, k), in units of each coordinate.
+        rest: those with information, likewise (p, p - k).
+        unit: unit of each coordinate, 1 / sqrt(I_ii), its standard error if all others were known (p,).
+        weakest: least eigenvalue of I along `rest`, in these units.
     """
 
     flat: Float[np.ndarray, "p k"]
@@ -48,15 +53,15 @@ class InformationRank(NamedTuple):
 def find_information_rank(information: Float[np.ndarray, "p p"]) -> InformationRank:
     """Return the flat and the other directions of information I (p, p), in units 1 / sqrt(I_ii) of each coordinate.
 
-    A direction is flat if its eigenvalue of I_ij / sqrt(I_ii I_jj) is below NOTHING. A coordinate without information
-    is a flat direction by itself. `weakest`: the smallest eigenvalue of the other directions.
+    A direction is flat if its eigenvalue of I_ij / sqrt(I_ii I_jj) is below NO_INFORMATION. A coordinate without
+    information is a flat direction by itself. `weakest`: the smallest eigenvalue of the other directions.
     """
     diagonal = np.diag(information)
     known = diagonal > 0
     unit = np.where(known, 1 / np.sqrt(np.where(known, diagonal, 1.0)), 1.0)
-    values, vectors = np.linalg.eigh(information * unit[:, None] * unit)
-    is_flat = values < NOTHING
-    weakest = float(values[~is_flat].min(initial=np.inf))
+    eigenvalues, vectors = np.linalg.eigh(information * unit[:, None] * unit)
+    is_flat = eigenvalues < NO_INFORMATION
+    weakest = float(eigenvalues[~is_flat].min(initial=np.inf))
     return InformationRank(flat=vectors[:, is_flat], rest=vectors[:, ~is_flat], unit=unit, weakest=weakest)
 
 
@@ -79,7 +84,8 @@ def find_confounded(
     fewest = min(rank.flat.shape[1] for rank in ranks)
     if not fewest:
         return []
-    of_logs, of_numbers = [], []  # flat directions at each point, in columns
+    of_logs = []
+    of_numbers = []  # flat directions at each point, in columns
     for x, rank in zip(points, ranks, strict=True):
         if rank.flat.shape[1] == fewest:
             # dv/dx and d log |v| / dx (p,) scale the rows of the flat directions, which `unit` takes to coordinates x.
@@ -94,8 +100,13 @@ def _differentiate_coordinates(parameters: Parameters, x: Float[np.ndarray, " p"
     """Return dv/dx and d log|v|/dx (p,) at x (p,), for each coordinate that belongs to one number v of the table.
 
     For other coordinates both are 1.
+
+    Args:
+        parameters: the free numbers.
+        x: the point in unconstrained coordinates (p,).
     """
-    slopes, log_slopes = np.ones(len(x)), np.ones(len(x))
+    slopes = np.ones(len(x))
+    log_slopes = np.ones(len(x))
     for entry, dv_dx, v in zip(parameters.entries, parameters.jacobian(x), parameters.entries_at(x), strict=True):
         i = entry.coordinate
         if i is not None:
@@ -107,8 +118,9 @@ def _differentiate_coordinates(parameters: Parameters, x: Float[np.ndarray, " p"
 
 def _orthonormalise(vectors: np.ndarray) -> np.ndarray:
     """Return an orthonormal basis, in columns, of what the columns of `vectors` span."""
-    left, size, _ = np.linalg.svd(vectors, full_matrices=False)
-    return np.asarray(left[:, size > SPANNED * max(size.max(initial=0.0), 1e-300)])
+    left, singular_values, _ = np.linalg.svd(vectors, full_matrices=False)
+    least = LEAST_SINGULAR_VALUE * max(singular_values.max(initial=0.0), 1e-300)  # smaller ones are rounding
+    return np.asarray(left[:, singular_values > least])
 
 
 def _group_connected_coordinates(bases: list[np.ndarray]) -> list[tuple[int, ...]]:
@@ -117,7 +129,7 @@ def _group_connected_coordinates(bases: list[np.ndarray]) -> list[tuple[int, ...
     `bases`: orthonormal flat directions at each point, in columns. A group of one is a coordinate that no data tell.
     """
     # An entry of the projector B B' is nonzero if some flat direction moves both coordinates.
-    are_connected = np.max([np.abs(B @ B.T) for B in bases], axis=0) > SAME
+    are_connected = np.max([np.abs(B @ B.T) for B in bases], axis=0) > ROUNDING_OF_DIRECTIONS
     count, labels = connected_components(are_connected, directed=False)
     groups = [tuple(np.flatnonzero(labels == i).tolist()) for i in range(count)]
     return [group for group in groups if are_connected[group, group].any()]
@@ -140,15 +152,15 @@ def _make_confounded_numbers(
     """
     # As many numbers have to be known as there are flat directions within the group.
     coordinates = list(group)
-    unknown = int(max(np.linalg.matrix_rank(basis[coordinates], tol=SAME) for basis in of_logs))
+    unknown = int(max(np.linalg.matrix_rank(basis[coordinates], tol=ROUNDING_OF_DIRECTIONS) for basis in of_logs))
     no_rows = np.zeros((0, len(group)))
     # Products: a sum of logarithms e' log v that no flat direction changes; used if its exponents are small and whole.
     powers = _find_identified_combinations([basis[coordinates] for basis in of_logs])
     if len(powers):
         # In each row the least exponent becomes 1.
         powers = powers / np.min(np.abs(np.where(powers == 0, np.inf, powers)), axis=1, keepdims=True)
-        are_whole = np.all(np.abs(powers - np.round(powers)) < WHOLE)
-        if are_whole and np.max(np.abs(powers)) <= LARGEST + WHOLE:
+        are_whole = np.all(np.abs(powers - np.round(powers)) < ROUNDING_OF_EXPONENTS)
+        if are_whole and np.max(np.abs(powers)) <= LARGEST_EXPONENT + ROUNDING_OF_EXPONENTS:
             return ConfoundedNumbers(group, exponents=np.round(powers), weights=no_rows, fix=unknown)
     # Otherwise sums w' v.
     sums = _find_identified_combinations([basis[coordinates] for basis in of_numbers])
@@ -156,13 +168,17 @@ def _make_confounded_numbers(
 
 
 def _find_identified_combinations(bases: list[np.ndarray]) -> np.ndarray:
-    """Return the combinations, in rows of reduced row echelon form, that no flat direction of any point changes.
+    """Return the combinations sum_i c_i v_i that no flat direction of any point changes, as rows c.
 
-    `bases`: flat directions at each point, in columns; the combinations are orthogonal to all of these. A singular
-    value up to SAME counts as 0.
+    The rows are in reduced row echelon form, so that each combination has few numbers. Along flat directions the
+    likelihood does not change.
+
+    Args:
+        bases: flat directions of the numbers v at each point, in columns (numbers, directions). The combinations are
+            orthogonal to all of these; a singular value up to ROUNDING_OF_DIRECTIONS counts as 0.
     """
     _, singular_values, right_vectors = np.linalg.svd(np.concatenate(bases, axis=1).T)
-    rank = int(np.count_nonzero(singular_values > SAME))
+    rank = int(np.count_nonzero(singular_values > ROUNDING_OF_DIRECTIONS))
     # Right singular vectors beyond the rank are orthogonal to all flat directions.
     return _reduce_to_echelon(right_vectors[rank:])
 
@@ -170,14 +186,14 @@ def _find_identified_combinations(bases: list[np.ndarray]) -> np.ndarray:
 def _reduce_to_echelon(rows: np.ndarray) -> np.ndarray:
     """Return the reduced row echelon form of a matrix of independent rows, by Gauss-Jordan elimination.
 
-    The leading entry of each row is 1, and the only one of its column; entries below SAME become 0.
+    The leading entry of each row is 1, and the only one of its column; entries below ROUNDING_OF_DIRECTIONS become 0.
     """
     reduced, column = rows.copy(), 0
     for row in range(len(reduced)):
         # The pivot is the largest entry from this row on, in the next column that has one above zero.
         while column < reduced.shape[1]:
             pivot = row + int(np.argmax(np.abs(reduced[row:, column])))
-            if abs(reduced[pivot, column]) > SAME:
+            if abs(reduced[pivot, column]) > ROUNDING_OF_DIRECTIONS:
                 break
             column += 1
         else:  # no column is left: the rows from here on are 0
@@ -189,12 +205,17 @@ def _reduce_to_echelon(rows: np.ndarray) -> np.ndarray:
             if other != row:
                 reduced[other] -= reduced[other, column] * reduced[row]
         column += 1
-    reduced[np.abs(reduced) < SAME] = 0.0
+    reduced[np.abs(reduced) < ROUNDING_OF_DIRECTIONS] = 0.0
     return reduced
 
 
 def format_product(names: list[str], exponents: Float[np.ndarray, " numbers"]) -> str:
-    """Return the text of a product of powers, such as "a * b^2 / c"."""
+    """Return the text of a product of powers, such as "a * b^2 / c".
+
+    Args:
+        names: names of the numbers.
+        exponents: exponent of each (numbers,).
+    """
     powers = list(zip(names, exponents, strict=True))
     factors = [_format_power(name, exponent) for name, exponent in powers if exponent > 0]
     divisors = [_format_power(name, -exponent) for name, exponent in powers if exponent < 0]
@@ -204,7 +225,11 @@ def format_product(names: list[str], exponents: Float[np.ndarray, " numbers"]) -
 def format_sum(names: list[str], weights: Float[np.ndarray, " numbers"]) -> str:
     """Return the text of a weighted sum, such as "a + 0.64 b".
 
-    A weight within SAME of 1 or -1 is not written, and a term of weight 0 is left out.
+    A weight within ROUNDING_OF_DIRECTIONS of 1 or -1 is not written, and a term of weight 0 is left out.
+
+    Args:
+        names: names of the numbers.
+        weights: weight of each (numbers,).
     """
     text = ""
     for name, weight in zip(names, weights, strict=True):
@@ -214,7 +239,7 @@ def format_sum(names: list[str], weights: Float[np.ndarray, " numbers"]) -> str:
                 text += f" {sign} "
             elif weight < 0:
                 text = sign
-            text += name if abs(abs(weight) - 1) < SAME else f"{abs(weight):.4g} {name}"
+            text += name if abs(abs(weight) - 1) < ROUNDING_OF_DIRECTIONS else f"{abs(weight):.4g} {name}"
     return text
 
 
@@ -224,9 +249,10 @@ def _format_power(name: str, exponent: float) -> str:
 
 
 def find_rank_of_late_rows(late: Float[np.ndarray, "p p"], ridges: int) -> InformationRank:
-    """Return the rank of the information `late` (p, p) of the second half of the rows, with `ridges` flat directions.
+    """Return the flat and other directions of the information `late` (p, p), with as many flat ones as `ridges`.
 
-    The initial state's law informs weakly on ridges, where no data do. The second half has hardly any of that.
+    `late` is the information of the second half of the rows. The law of the initial state, which the first half has,
+    informs weakly also on ridges, along which no data do. `ridges` was found at points where rounding matters less.
     """
     rank = find_information_rank(late)
     if rank.flat.shape[1] == ridges:

@@ -22,8 +22,8 @@ from heliograph.random_affine.words.bit_flips import Flips
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 
-MOST = 24  # bits of a word
-STEPS = 300  # of the relaxation
+MOST_BITS = 24  # bits of a word
+RELAXATION_STEPS = 300  # of the relaxation
 ROUNDING = 1e-13  # relative decrease of the error that is rounding's
 
 
@@ -48,6 +48,10 @@ def _refuse_overload(network: Network, encoders: Mapping[str, Words]) -> None:
     """Raise ValueError if words of these senders overload in more than 1 of 1000 steps of the steady state.
 
     Their error is not that of rounding then. The linear filter of the words judges it, from the steady law on.
+
+    Args:
+        network: the network, with its plant, sensors and channels.
+        encoders: encoder of each node that sends, by the name of the node.
     """
     plant = network.plant
     assert isinstance(plant, LinearPlant) and isinstance(plant.noise, AbstractNoise)
@@ -67,8 +71,12 @@ def _refuse_overload(network: Network, encoders: Mapping[str, Words]) -> None:
 class _PlantAndSenders(NamedTuple):
     """Linear plant and its senders, each of which sends one output c_i x + v_i as a word of some bits.
 
-    transition, process: A and Q of the plant. rows: c_i of the sensors. information: [i, B] = j_i(B), what a word of B
-    bits says of c_i x, as the inverse of a noise variance, for B from 0 to MOST.
+    Args:
+        transition: A of the plant (n, n).
+        process: covariance Q of its noise (n, n).
+        rows: c_i of each sender's sensor (senders, n).
+        information: [i, B] = j_i(B), what a word of B bits says of c_i x, as the inverse of a noise variance, for B
+            from 0 to MOST_BITS (senders, MOST_BITS + 1).
     """
 
     transition: Float[np.ndarray, "n n"]
@@ -123,7 +131,9 @@ def design_bits(network: Network, total: int) -> BitsDesign:
 
 
 def _collect_plant_and_senders(network: Network) -> _PlantAndSenders:
-    """Return plant, sensors and the information of their words of 0 to MOST bits, as arrays.
+    """Return plant, sensors and the information of their words of 0 to MOST_BITS bits, as arrays.
+
+    `network`: nodes whose senders send words.
 
     Raises:
         ValueError: a plant that is not linear and stable; a node without an encoder, or with several outputs.
@@ -135,7 +145,8 @@ def _collect_plant_and_senders(network: Network) -> _PlantAndSenders:
     a, q = np.asarray(plant.matrix), np.asarray(plant.noise.covariance)
     if spectral_radius(a) >= 1:
         raise fail("plant of a design of bits", expected, f"one of spectral radius {spectral_radius(a):.3g}")
-    rows, information = list[np.ndarray](), list[np.ndarray]()
+    rows = list[np.ndarray]()
+    information = list[np.ndarray]()
     for name, node in network.nodes.items():
         if not isinstance(node, Node) or node.encoder is None or len(node.outputs) != 1:
             raise fail(f"node {name!r} of a design of bits", "one with an encoder and one output", "another")
@@ -149,7 +160,7 @@ def _collect_plant_and_senders(network: Network) -> _PlantAndSenders:
 
 
 def _compute_word_information(variance: float, encoder_range: float, gain: float) -> Float[np.ndarray, " bits"]:
-    """Return the information j(B) of words of B = 0 to MOST bits about the measured value; it is 0 for no bits.
+    """Return the information j(B) of words of B = 0 to MOST_BITS bits about the measured value; it is 0 for no bits.
 
     j(B) = 1 / (R + D^2/12 + U (1/g^2 - 1)), with the step D = range / (2^B - 1), and U = D^2 (4^B - 1)/12 the variance
     of uniform words.
@@ -159,7 +170,7 @@ def _compute_word_information(variance: float, encoder_range: float, gain: float
         encoder_range: width of the range of values that the words cover.
         gain: g = 1 - 2p of each bit, where p is the probability that it is flipped.
     """
-    counts = np.arange(1, MOST + 1)
+    counts = np.arange(1, MOST_BITS + 1)
     step = encoder_range / (2.0**counts - 1)
     # Of gain 0, bits that are flipped half of the time, a word says nothing.
     noise = gain**2 * (variance + step**2 / 12) + step**2 / 12 * (4.0**counts - 1) * (1 - gain**2)
@@ -167,15 +178,23 @@ def _compute_word_information(variance: float, encoder_range: float, gain: float
 
 
 def _find_bit_gain(name: str, node: Node) -> float:
-    """Return the gain g = 1 - 2p of a node's link for one bit, where p is its error rate.
+    """Return g = 1 - 2p for a node's link, which flips each bit of a word with the constant probability p.
+
+    A word of value q, counted from the middle of its range, arrives with the mean g q: so g is the factor of the signal
+    in what arrives, by which `_compute_word_information` finds how much a word says.
+
+    Args:
+        name: name of the node, for messages.
+        node: the node; its channel carries words of bits.
 
     Raises:
         ValueError: an error rate that is not constant, or another channel.
     """
     link = node.channel
     if isinstance(link, Flips) and isinstance(link.error, Constant):
-        return float(link.gain.moment(1))
-    if isinstance(link, GainAndNoise):  # a selection, as an encoder demands
+        return float(link.gain.moment(1))  # E[1 - 2p], with p a constant
+    # Of this class a node with an encoder has only maps that hand on words as they are, such as `perfect()`.
+    if isinstance(link, GainAndNoise):
         return 1.0
     raise fail(f"channel of node {name!r} of a design of bits", "decode_and_forward with constant rates, or perfect()",
                type(link).__name__)  # fmt: skip
@@ -191,6 +210,10 @@ def _compute_steady_covariance(senders: _PlantAndSenders, j: Float[np.ndarray, "
     """Return the steady covariance P = (X^-1 + sum_i j_i c_i c_i')^-1 after words of information j.
 
     X is the covariance before the words, and c_i the row of sender i.
+
+    Args:
+        senders: the plant, and the rows c_i of the senders.
+        j: information of each sender's word, 1 over its noise's variance; 0 if it sends nothing (senders,).
     """
     # Leave out senders of no bits, whose noise 1 / j is infinite.
     sends = j > 0
@@ -215,6 +238,10 @@ def _compute_error_slopes(senders: _PlantAndSenders, j: Float[np.ndarray, " send
     """Return the derivatives of the steady trace by each j_i: -c_i' P Y P c_i, with Y = I + M' Y M.
 
     P is the covariance after the words, X before them, and M = (I - K C) A = P X^-1 A maps the error from step to step.
+
+    Args:
+        senders: the plant, and the rows c_i of the senders.
+        j: information of each sender's word (senders,).
     """
     A, Q = senders.transition, senders.process
     P = _compute_steady_covariance(senders, j)
@@ -230,23 +257,28 @@ def _add_bits_greedily(senders: _PlantAndSenders, total: int) -> Float[np.ndarra
     """Return the bits of each sender, added where the error falls most for a bit, until `total` of them are spent.
 
     Several may be added at once to one sender; fewer are spent where none lowers the error.
+
+    Args:
+        senders: plant, sensors, and the information of a word by its bits.
+        total: bits of all words of a step together.
     """
     bits = np.zeros(len(senders.rows), dtype=int)
     error = _compute_steady_error(senders, _information_of_bits(senders, bits))
     while (left := total - bits.sum()) > 0:
-        # (decrease of the error for each bit, sender, bits added, error then): the first counts most.
+        # The largest decrease of the error for each bit, with (sender, bits added, error then) to compare equal ones
+        # by.
         best = (0.0, 0, 0, error)
         for i in range(len(bits)):
-            for more in range(1, min(left, MOST - bits[i]) + 1):
+            for more in range(1, min(left, MOST_BITS - bits[i]) + 1):
                 tried = bits.copy()
                 tried[i] += more
-                lower = _compute_steady_error(senders, _information_of_bits(senders, tried))
-                best = max(best, ((error - lower) / more, i, more, lower))
-        decrease, sender, more, lower = best
-        if decrease * more <= ROUNDING * error:
+                error_then = _compute_steady_error(senders, _information_of_bits(senders, tried))
+                best = max(best, ((error - error_then) / more, i, more, error_then))
+        decrease_per_bit, sender, more, error_then = best
+        if decrease_per_bit * more <= ROUNDING * error:
             return bits
         bits[sender] += more
-        error = lower
+        error = error_then
     return bits
 
 
@@ -254,13 +286,18 @@ def _bound_by_relaxation(senders: _PlantAndSenders, total: int) -> float:
     """Return a lower bound of the error for any split of this total of bits, with real bits and concave information.
 
     The error is convex in j, so its tangent at any j is nowhere above it, and the tangent's least value over all splits
-    is a bound. The points j come from Frank and Wolfe's steps j + 2 / (k + 2) (best - j). `hulls`: the concave envelope
-    of each sender's information over its bits, on which bits may be real.
+    is a bound. The points j come from Frank and Wolfe's steps j + 2 / (k + 2) (best - j). Bits may be real numbers on
+    the concave envelope of each sender's information over its bits (`hulls`).
+
+    Args:
+        senders: plant, sensors, and the information of a word by its bits.
+        total: bits of all words of a step together.
     """
     hulls = [_find_envelope(values) for values in senders.information]
     j, bound = np.zeros(len(hulls)), -np.inf
-    for k in range(STEPS):
-        slopes, error = _compute_error_slopes(senders, j), _compute_steady_error(senders, j)
+    for k in range(RELAXATION_STEPS):
+        slopes = _compute_error_slopes(senders, j)
+        error = _compute_steady_error(senders, j)
         best_on_tangent = _spend_bits(hulls, -slopes, total)
         least_on_tangent = error - float(slopes @ (j - best_on_tangent))
         bound = max(bound, least_on_tangent)
@@ -269,7 +306,10 @@ def _bound_by_relaxation(senders: _PlantAndSenders, total: int) -> float:
 
 
 def _find_envelope(values: Float[np.ndarray, " bits"]) -> list[tuple[int, float]]:
-    """Return the corners (B, j) of the concave envelope of j(B) = values[B], from B = 0 on, as long as it rises."""
+    """Return the corners (B, j) of the concave envelope of j(B) = values[B], from B = 0 on, as long as it rises.
+
+    The envelope is the least concave function above j: lines between these corners.
+    """
     corners = [(0, float(values[0]))]
     while corners[-1][0] < len(values) - 1:
         # The next corner is the point to which the line from here rises most steeply.
@@ -286,15 +326,22 @@ def _find_envelope(values: Float[np.ndarray, " bits"]) -> list[tuple[int, float]
 def _spend_bits(hulls: list[list[tuple[int, float]]], worth: np.ndarray, total: int) -> Float[np.ndarray, " senders"]:
     """Return the information j_i (senders,) of real bits, `total` in sum, that maximises sum_i worth_i j_i.
 
-    The steepest edges of the envelopes come first. `hulls`: corners (bits, j) of each sender's concave envelope,
-    between which j is linear.
+    The steepest edges of the envelopes come first, weighted by worth: so each bit goes where it counts most.
+
+    Args:
+        hulls: corners (bits, j) of each sender's concave envelope of j over bits, between which j is linear.
+        worth: what a unit of each sender's information is worth (senders,).
+        total: sum of the bits.
     """
-    edges = [  # (worth of a bit, sender, bits, information)
+    # Edges between the corners (a bits, information low) and (b bits, information high) of each envelope, as (worth of
+    # a bit, sender, bits, information).
+    edges = [
         (worth[i] * (high - low) / (b - a), i, b - a, high - low)
         for i, hull in enumerate(hulls)
         for (a, low), (b, high) in pairwise(hull)
     ]
-    j, left = np.zeros(len(hulls)), float(total)
+    j = np.zeros(len(hulls))
+    left = float(total)
     for _, sender, bits, information in sorted(edges, reverse=True):
         share = min(1.0, left / bits)
         j[sender] += share * information

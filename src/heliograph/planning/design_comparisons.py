@@ -30,7 +30,7 @@ Advance = TypeAliasType("Advance", Callable[[str], None])
 
 
 def _report_nothing(what: str) -> None:
-    """Do nothing with a word on what comes next: progress is not reported."""
+    """Do nothing: the default for `advance`, by which progress is not reported."""
 
 
 @readable
@@ -121,7 +121,8 @@ def error_over_sites(
     # Check the design, the function and the places.
     instance("design", best, PowerDesign, "a PowerDesign")
     function("network of a map", build, "x and y")
-    columns, rows = array("x of a map", x, (None,)), array("y of a map", y, (None,))
+    columns = array("x of a map", x, (None,))
+    rows = array("y of a map", y, (None,))
     # The design is made again at each place. A few starts are enough, since errors are only compared.
     problem = best.problem.replace_total(best.total)
     problem = replace(problem, starts=min(problem.starts, SITE_STARTS))
@@ -138,9 +139,12 @@ def error_over_sites(
 
 @readable
 class ChangeWorth(NamedTuple):
-    """Worth of a change: the error (or the power, of a target error) of the design made again, and what that saves.
+    """Worth of a change of the network.
 
-    name: "one more a", "without a", "a relay halfway of a.hop1".
+    Args:
+        name: what changes: "one more a", "without a", "a relay halfway of a.hop1".
+        value: error of the design made again, or its power if an error is the target.
+        saved: how much less it is than before the change.
     """
 
     name: str
@@ -227,15 +231,25 @@ def _list_relays(
 ) -> dict[str, DesignProblem]:
     """Return {name of a change: the design problem} with a relay in the middle of each hop of the node `name`.
 
-    `nodes`: all, without filters. A relay changes the numbers in the names of hops behind it, so that nodes are free as
+    A relay changes the numbers in the names of hops behind it, so that nodes are free as
     a whole. It has the limits of the transmitter whose hop it halves.
+
+    Args:
+        problem: the design problem of the unchanged network.
+        network: the unchanged network.
+        nodes: all its nodes, without filters.
+        name: name of the node whose hops get a relay.
+        exponent: exponent of the path loss: power falls as distance^-exponent.
     """
-    node, problems, free = nodes[name], dict[str, DesignProblem](), _list_free_names(problem)
+    node = nodes[name]
+    problems = dict[str, DesignProblem]()
+    free = _list_free_names(problem)
     assert isinstance(node.channel, AbstractRandomAffine)
     free_nodes = None if free is None else tuple(dict.fromkeys(_find_node_of_transmitter(each) for each in free))
     hops = transmitter_names(node.channel)
     for i, hop in enumerate(hops):
         channel = _insert_relay(node.channel, hop, exponent)
+        # Hop i becomes the hops i and i + 1, and those behind it move on by one.
         now = [f"{name}.{each}" for each in transmitter_names(channel)]
         renamed: dict[str, tuple[str, ...]] = {f"{name}.{each}": (now[j + (j > i)],) for j, each in enumerate(hops)}
         renamed[f"{name}.{hop}"] = (now[i], now[i + 1])
@@ -262,6 +276,10 @@ def _change_nodes(
     """
 
     def rename(limit: PerTransmitter) -> PerTransmitter:
+        """Return a limit with the names that transmitters have in the changed network; a number for all as it is.
+
+        `renamed` has the new names of each transmitter that has others; it may be doubled, or left out.
+        """
         if not isinstance(limit, dict):
             return limit
         return {new: number for name, number in limit.items() for new in renamed.get(name, (name,))}

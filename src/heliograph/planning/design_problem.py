@@ -68,11 +68,15 @@ class DesignProblem:
 class Certificate(NamedTuple):
     """Certificate of a design: what is known of the best that its limits allow.
 
-    convex: whether every local minimum is global. value: the error found, or the power where an error is the target.
-    bound: no design has less, whatever was searched. stationarity: the part of the value by which a linear model still
-    sees it fall within the limits; zero if and only if the conditions of Karush, Kuhn and Tucker hold (of free numbers:
-    over a step of the size of their range, or of their start where they have none). starts: number of descents. unit:
-    "error" or "power".
+    Args:
+        convex: whether every local minimum is global.
+        value: the error found, or the power where an error is the target.
+        bound: no design has less, whatever was searched.
+        stationarity: the part of the value by which a linear model still sees it fall within the limits; zero if and
+            only if the conditions of Karush, Kuhn and Tucker hold (of free numbers: over a step of the size of their
+            range, or of their start where they have none). NaN where it is not known.
+        starts: number of descents.
+        unit: "error" or "power".
     """
 
     convex: bool
@@ -89,11 +93,7 @@ class Certificate(NamedTuple):
 
     @property
     def words(self) -> str:
-        """Sentence on what the numbers certify.
-
-        `bound`: no design has less. `unit`: what is made small, "error" or "power". `stationarity`: how far the slope
-        at the best point is from zero, NaN if it is not known. `starts`: the number of starts of the search.
-        """
+        """Sentence on what the numbers certify: how near the value is to the best, and what was searched."""
         if self.convex:
             return f"optimal within {self.gap:.1e}: the problem is convex, and no {self.unit} is below {self.bound:.6g}"
         starts = "the one start" if self.starts == 1 else f"{self.starts} starts"
@@ -108,13 +108,20 @@ class Certificate(NamedTuple):
 class PowerDesign(Module):
     """Design of a network: powers of its transmitters, the error they attain, and a certificate.
 
-    problem: what was to be designed. powers: of every transmitter, {name: (steps,)}, steps of the error's period or
-    horizon (one if steady). error: attained; present: that of the network as it is (NaN of independent paths, which
-    have no powers yet). covariance: P after each step, (steps, n, n). sensitivity: the error's derivative by the mean
-    power of each transmitter; price: the error that one more watt of the total takes away, sent where no other limit
-    binds; without a total, one more of the transmitter that it helps most, whose own limit rises. Of free numbers both
-    come from Lagrange's multipliers: zero where no limit of power binds. numbers: the free numbers of a network that is
-    a function of them. realised: the network at these numbers, None where powers alone were designed.
+    Of free numbers, sensitivity and price come from Lagrange's multipliers: zero where no limit of power binds.
+
+    Args:
+        problem: what was to be designed.
+        powers: of every transmitter, {name: (steps,)}, steps of the error's period or horizon (one if steady).
+        error: the error attained.
+        certificate: what is known of the best that the limits allow.
+        present: the error of the network as it is (NaN of independent paths, which have no powers yet).
+        covariance: P after each step, (steps, n, n).
+        sensitivity: the error's derivative by the mean power of each transmitter.
+        price: the error that one more watt of the total takes away, sent where no other limit binds; without a total,
+            one more of the transmitter that it helps most, whose own limit rises.
+        numbers: the free numbers of a network that is a function of them.
+        realised: the network at these numbers, None where powers alone were designed.
     """
 
     problem: "DesignProblem"

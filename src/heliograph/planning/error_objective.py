@@ -11,7 +11,8 @@ from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import ArrayLike, Float
 
 WEIGHT = "weight of the error"
-SHARPER = (16, 128, 2048, 32768)  # smoothing of the largest eigenvalue, less and less: n^(1/32768) is left at the end
+# Smoothing of the largest eigenvalue, less and less: n^(1/32768) is left at the end.
+SHARPNESSES = (16, 128, 2048, 32768)
 
 Matrices = Float[np.ndarray, "time n n"]
 
@@ -48,7 +49,10 @@ class Error(Module):
         at_end: bool = False,
         period: int = 1,
     ):
-        """Check and hold which number is made of the covariance P, and of which steps."""
+        """Check and hold which number is made of the covariance P, and of which steps.
+
+        The arguments are those of the class.
+        """
         if isinstance(weight, Mapping):
             self.weight = dict(weight)
         else:
@@ -67,7 +71,7 @@ class Error(Module):
         return self.period if self.horizon is None else self.horizon
 
     def matrix(self, states: tuple[str, ...]) -> Float[np.ndarray, "n n"]:
-        """Return the weight W (n, n) for a plant with these states.
+        """Return the weight W (n, n) of the error <W, P> for a plant with these states; P is the filter's covariance.
 
         Args:
             states: names of the plant's states.
@@ -94,32 +98,42 @@ class Error(Module):
         """Return the number to be made small, as a function of covariances, for a plant with these states.
 
         `self.matrix`: the weight of the states' covariance. If the worst direction counts (`self.worst`), the number is
-        the largest eigenvalue, smoothed by an exponent of SHARPER, the sharpest last.
+        the largest eigenvalue, smoothed by an exponent of SHARPNESSES, the sharpest last.
         """
-        # Only the last step counts, or all steps count alike.
+        # Only the last step counts (the last unit vector), or all steps count alike.
         shares = np.eye(self.steps)[-1] if self.at_end else np.full(self.steps, 1 / self.steps)
         weight = np.tile(self.matrix(states), (self.steps, 1, 1))
-        return Criterion(weight=weight, shares=shares, sharpness=SHARPER[-1] if self.worst else None)
+        return Criterion(weight=weight, shares=shares, sharpness=SHARPNESSES[-1] if self.worst else None)
+
+
+class SmoothedError(NamedTuple):
+    """A criterion's number at some covariances P_k, smoothed if it is an eigenvalue, and its derivative by each P_k."""
+
+    value: float
+    slopes: Matrices
 
 
 class Criterion(NamedTuple):
     """Number sum_k share_k f(P_k), with f = <W, P>, or the largest eigenvalue of S = W^1/2 P W^1/2.
 
-    sharpness: None for the trace, else q: the eigenvalue as tr(S^q)^(1/q), smooth, and above it by no more than the
-    factor n^(1/q).
+    Args:
+        weight: W of each step (time, n, n).
+        shares: share of each step (time,), which sum to 1.
+        sharpness: None for the trace <W, P>. Else q: the eigenvalue is smoothed as tr(S^q)^(1/q), which is above it by
+            no more than the factor n^(1/q).
     """
 
     weight: Matrices
     shares: Float[np.ndarray, "time"]
     sharpness: int | None
 
-    def smooth(self, p: Matrices) -> tuple[float, Matrices]:
-        """Return the number f at covariances p (time, n, n), smoothed if it is an eigenvalue, and each df/dP_k.
+    def smooth(self, p: Matrices) -> SmoothedError:
+        """Return the number at covariances P (time, n, n), smoothed if it is an eigenvalue, with its derivatives.
 
-        The search minimises this; `compute_exact_error` is the error itself. `self.shares`: the weight of each step.
+        The search minimises this; `compute_exact_error` is the error itself.
         """
-        values, weights = self._differentiate_steps(p)
-        return float(self.shares @ values), self.shares[:, None, None] * weights
+        values, slopes = self._differentiate_steps(p)
+        return SmoothedError(value=float(self.shares @ values), slopes=self.shares[:, None, None] * slopes)
 
     def compute_exact_error(self, p: Matrices) -> float:
         """Return the error at covariances p (time, n, n), without smoothing of an eigenvalue.
@@ -128,7 +142,7 @@ class Criterion(NamedTuple):
         is that of the largest eigenvalue of W^1/2 P W^1/2.
         """
         if self.sharpness is None:
-            return self.smooth(p)[0]
+            return self.smooth(p).value
         root = _find_root(self.weight)
         return float(self.shares @ np.linalg.eigvalsh(root @ p @ root)[:, -1])
 
@@ -148,7 +162,7 @@ class Criterion(NamedTuple):
 
     def list_from_smoothest(self) -> "list[Criterion]":
         """Return the criteria from the smoothest to this one, by which a search begins: only this one for a trace."""
-        return [self] if self.sharpness is None else [self._replace(sharpness=q) for q in SHARPER]
+        return [self] if self.sharpness is None else [self._replace(sharpness=q) for q in SHARPNESSES]
 
     def _differentiate_steps(self, p: Matrices) -> tuple[Float[np.ndarray, "time"], Matrices]:
         """Return f(P_k) (time,) and df/dP_k (time, n, n) of each step: f is tr W P or the smoothed eigenvalue.

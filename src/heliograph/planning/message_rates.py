@@ -20,11 +20,11 @@ from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.simulate import monte_carlo
 
-NODES = 80  # Gauss-Legendre nodes of each part of the line: the densities are smooth in each
-RAREST = 1e-6  # rate of messages that a grid holds
-LONGEST = 100  # deviations of a step from 0, beyond which there are too many nodes
+QUADRATURE_NODES = 80  # Gauss-Legendre nodes of each part of the line: the densities are smooth in each
+RAREST_RATE = 1e-6  # rate of messages that a grid holds
+LONGEST_LINE = 100  # deviations of a step from 0, beyond which there are too many nodes
 GRID_ACCURACY = 1e-3  # relative, of a rate by a grid
-REACH = 12.0  # deviations at which a density ends
+TAIL_DEVIATIONS = 12.0  # deviations at which a density ends
 
 
 @readable
@@ -119,17 +119,18 @@ def prediction_error_rate(plant: AnyPlant, sensor: AnySensor, delta: float, loss
     """
     system = _require_scalar_system(plant, sensor)
     a, q, c, r = system
-    delta, loss = float(scalar("delta", delta, TINY)), float(scalar("loss", loss, 0.0, 1.0))
+    delta = float(scalar("delta", delta, TINY))
+    loss = float(scalar("loss", loss, 0.0, 1.0))
     if loss == 1:
         raise fail("loss", "a number below 1", loss)
     posterior = system.kalman_variance
     s = (a * a * posterior + q) / np.sqrt(a * a * posterior + q + r / c**2)
     # The line in parts, within delta and beyond, with nodes and weights of an integral over it. Beyond delta e stays
     # only where what is sent is lost, so that without losses there is nothing.
-    far = delta + REACH * s / np.sqrt(1 - loss)
+    far = delta + TAIL_DEVIATIONS * s / np.sqrt(1 - loss)
     edges = [-far, -delta, delta, far] if loss else [-delta, delta]
-    if far > LONGEST * s:
-        most = f"a line of at most {LONGEST} deviations of a step, {LONGEST * s:.3g}"
+    if far > LONGEST_LINE * s:
+        most = f"a line of at most {LONGEST_LINE} deviations of a step, {LONGEST_LINE * s:.3g}"
         raise fail("delta and loss", most, f"{far:.3g}")
     nodes, weights = _make_quadrature(edges, s)
     # The integral equation of v at the nodes (Nystrom's method), then the sums over a cycle.
@@ -185,8 +186,8 @@ def send_on_delta_rate(plant: AnyPlant, sensor: AnySensor, delta: float) -> floa
     """
     system = _require_scalar_system(plant, sensor, without_inputs=True)
     rate = _send_on_delta_rate(system, float(scalar("delta", delta, TINY)))
-    if rate < RAREST:
-        raise fail("delta", f"one at which more than {RAREST:g} messages are sent a step", f"{delta:g}")
+    if rate < RAREST_RATE:
+        raise fail("delta", f"one at which more than {RAREST_RATE:g} messages are sent a step", f"{delta:g}")
     return rate
 
 
@@ -198,13 +199,14 @@ def _send_on_delta_rate(system: ScalarSystem, delta: float) -> float:
     if not abs(system.a) < 1:
         raise fail("plant", "a stable one, which has a rate in the long run", f"a = {system.a:g}")
     # Change to the unit of the state, so that c is 1.
-    delta, system = delta / abs(system.c), system._replace(c=1.0, r=system.r / system.c**2)
-    coarse_rate, coarse_cell = compute_rate_on_grid(system, delta, share=0.8)
-    fine_rate, fine_cell = compute_rate_on_grid(system, delta, share=0.5)
-    if fine_rate == coarse_rate:  # if nothing is ever sent, both grids say 0
-        return fine_rate
+    delta = delta / abs(system.c)
+    system = system._replace(c=1.0, r=system.r / system.c**2)
+    coarse = compute_rate_on_grid(system, delta, share=0.8)
+    fine = compute_rate_on_grid(system, delta, share=0.5)
+    if fine.rate == coarse.rate:  # if nothing is ever sent, both grids say 0
+        return fine.rate
     # Take off the error of the rectangle rule at the cut at delta, which is a multiple of the cell's size squared.
-    return float(fine_rate + (fine_rate - coarse_rate) * fine_cell**2 / (coarse_cell**2 - fine_cell**2))
+    return float(fine.rate + (fine.rate - coarse.rate) * fine.cell**2 / (coarse.cell**2 - fine.cell**2))
 
 
 def delta_for_rate(plant: AnyPlant, sensor: AnySensor, rate: float) -> float:
@@ -225,7 +227,14 @@ def delta_for_rate(plant: AnyPlant, sensor: AnySensor, rate: float) -> float:
 def _find_threshold(
     rate: float, rate_at: Callable[[float], float], system: ScalarSystem, accuracy: float = 1e-10
 ) -> float:
-    """Return the threshold delta at which the falling function `rate_at(delta)` has this rate."""
+    """Return the threshold delta at which the falling function `rate_at(delta)` has this rate.
+
+    Args:
+        rate: the rate of messages, between 0 and 1.
+        rate_at: the rate of messages by threshold.
+        system: plant and sensor, whose noises give a first guess.
+        accuracy: relative accuracy of the threshold.
+    """
     if not 0 < scalar("rate", rate) < 1:
         raise fail("rate", "a number between 0 and 1", rate)
     # The deviation of a measured value from one step to the next is a first guess of the threshold.
@@ -242,6 +251,11 @@ def _require_scalar_system(plant: AnyPlant, sensor: AnySensor, without_inputs: b
     """Return a, q, c, r of a linear plant and sensor of one number and Gaussian noise each; ValueError for others.
 
     Refused are angles too, a plant without noise and a sensor of nothing, behind which there is nothing to send.
+
+    Args:
+        plant: the plant.
+        sensor: the sensor.
+        without_inputs: whether a plant with inputs is refused too.
     """
     expected = "a LinearPlant and LinearSensor of one state and output"
     if not isinstance(plant, LinearPlant) or not isinstance(sensor, LinearSensor):
@@ -271,14 +285,14 @@ def _require_scalar_system(plant: AnyPlant, sensor: AnySensor, without_inputs: b
 def _make_quadrature(edges: list[float], unit: float) -> tuple[np.ndarray, np.ndarray]:
     """Return Gauss-Legendre nodes and weights on a line that is cut at `edges`, and into intervals of at most 8 units.
 
-    NODES nodes suffice on each interval, since the integrand changes over a unit or more.
+    QUADRATURE_NODES nodes suffice on each interval, since the integrand changes over a unit or more.
     """
     intervals: list[tuple[float, float]] = []
-    for begin, end in pairwise(edges):
+    for begin, end in pairwise(edges):  # each part of the line
         count = int(np.ceil((end - begin) / (8 * unit)))
         intervals += pairwise(np.linspace(begin, end, count + 1))
     # Nodes and weights of the interval from -1 to 1, moved to each of these.
-    x, w = np.polynomial.legendre.leggauss(NODES)
+    x, w = np.polynomial.legendre.leggauss(QUADRATURE_NODES)
     nodes = np.concatenate([(a + b) / 2 + (b - a) / 2 * x for a, b in intervals])
     weights = np.concatenate([(b - a) / 2 * w for a, b in intervals])
     return nodes, weights

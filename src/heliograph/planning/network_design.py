@@ -131,7 +131,8 @@ def _design_powers(problem: DesignProblem) -> PowerDesign:
         limits = make_unlimited(error.steps, int(free.sum()))
     else:
         limits = make_power_limits(make_budget(problem.budget), paths.names, free, present_powers)
-    starts, seed = check_count("starts", problem.starts), check_seed("seed", problem.seed)
+    starts = check_count("starts", problem.starts)
+    seed = check_seed("seed", problem.seed)
     # A target error, or None: then the least error within the budget is sought.
     target = None if problem.target_error is None else float(scalar("target error", problem.target_error, 0.0))
     task = make_power_task(paths, error.criterion(states), limits, free, present_powers, starts, seed)
@@ -141,7 +142,12 @@ def _design_powers(problem: DesignProblem) -> PowerDesign:
 
 
 def _check_paths(paths: Paths, problem: DesignProblem) -> None:
-    """Raise ValueError unless paths that were made from arrays fit the problem's error, and all powers are free."""
+    """Raise ValueError unless paths that were made from arrays fit the problem's error, and all powers are free.
+
+    Args:
+        paths: the paths, made for some number of steps.
+        problem: the design problem, with its error.
+    """
     error, steps = problem.criterion, len(paths.kappa)
     if error.steps != steps or (error.horizon is None) != (paths.plants.start is None):
         raise fail("error", f"that over {steps} steps for which the paths were made", f"{error.steps}")
@@ -218,7 +224,12 @@ def _find_relay_power_limits(problem: DesignProblem) -> float | None:
 
 
 def _make_relay_network(relays: RelayNetwork, gains: Gains) -> Network:
-    """Return a network of relays with gains by slot, and the best receiver for them, for at least COVERED steps."""
+    """Return a network of relays with gains by slot, and the best receiver for them, for at least COVERED steps.
+
+    Args:
+        relays: plant, sensor, relays, and the links of each slot.
+        gains: {relay: gains of its estimator (slots, n, received)}.
+    """
     slots, n = len(relays.slots), len(relays.states)
     # The slots of a period are repeated until COVERED steps are reached.
     times = ceil(COVERED / slots)

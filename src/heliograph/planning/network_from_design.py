@@ -79,7 +79,11 @@ def designed_network(network: Network, powers: Mapping[str, Float[np.ndarray, "s
 
 
 def repeat_network(network: Network) -> Network:
-    """Return the network with everything that varies over time repeated, so that it lasts for a long run."""
+    """Return the network with everything that varies over time repeated, so that it lasts for a long run.
+
+    A design of a period covers only one period; what varies over time (`OverTime`) is repeated to COVERED (100) steps
+    or more.
+    """
 
     def repeat(leaf: object) -> object:
         """Return an OverTime repeated to COVERED steps or more; anything else as it is."""
@@ -95,7 +99,13 @@ def repeat_network(network: Network) -> Network:
 
 
 def _check_powers(powers: object, nodes: Mapping[str, Node], steps: int) -> dict[str, Float[np.ndarray, "steps"]]:
-    """Return the powers (steps,) by transmitter; raise ValueError for unknown names, bad shapes, negative powers."""
+    """Return the powers (steps,) by transmitter; raise ValueError for unknown names, bad shapes, negative powers.
+
+    Args:
+        powers: {transmitter: (steps,)}, as the user gives them.
+        nodes: nodes by name, whose channels have the transmitters.
+        steps: number of steps.
+    """
     known = {f"{name}.{hop}" for name, node in nodes.items() for hop in transmitter_names(first(node.channel))}
     given = table("powers of a network", powers, "powers")
     unknown = sorted(set(given) - known)
@@ -111,6 +121,11 @@ def add_best_filter(plant: AnyPlant, node: Node, channel: Channel) -> Node:
     """Return the node with this channel, and with the best linear filter behind it as its only filter.
 
     The node's limits were made for its own channel. Behind another channel, only its invalid values still hold.
+
+    Args:
+        plant: the plant.
+        node: the node, with its sensor and limits.
+        channel: the channel that it gets.
     """
     filters = {BEST: linear_filter(plant, node.sensor, channel)}
     if node.limits is None or are_same(channel, node.channel):
@@ -128,5 +143,5 @@ def _select_powers_of_node(name: str, powers: Mapping[str, Float[np.ndarray, "st
 
 
 def _join_steps_over_time(steps: Sequence[T]) -> T | OverTime:
-    """Return the single object of one step, which then holds for ever; of several steps an OverTime."""
+    """Return the objects of all steps as one `OverTime`; of a single step the object itself, which holds for ever."""
     return steps[0] if len(steps) == 1 else over_time(steps)

@@ -7,7 +7,7 @@ from heliograph.factors.square_root_update import observe_information, roots_of
 from heliograph.model.sensor import LinearSensor
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import Float
-from heliograph.planning.sum_of_links import ALIKE, SummedLinks
+from heliograph.planning.sum_of_links import RELATIVE_ROUNDING, SummedLinks
 from heliograph.planning.transmitters import (
     amplify_transmitter,
     compute_sent_powers,
@@ -50,12 +50,14 @@ def find_links_of_sum(node: Node, second: Float[np.ndarray, "m1 m1"]) -> tuple[S
         amplified = amplify_transmitter(unit, hop, factor=None)
         assert isinstance(amplified, Superposed)
         unit = amplified
-    # Of each link E g, Var g, and the variance of its own noise; the noises add up with that of the receiver. The
-    # centre of second moments is Cov of (g, n) x (g, n): [0, 0, 0, 0] is Var g, [0, 0, -1, -1] is Var n.
+    # Of each link E g, Var g, and the variance of its own noise n; the noises add up with that of the receiver.
+    # spread[i, j, a, b] is the covariance of entries (i, a) and (j, b) of the matrix (g, n) of a link, of one row: the
+    # entry 0 of a row is g, and the last one n.
     moments = [second_order(link) for link in unit.maps]
+    spreads = [link.nominal.center for link in moments]
     mean = np.array([float(link.mean_gain[0, 0]) for link in moments])
-    variance = np.array([float(link.nominal.center[0, 0, 0, 0]) for link in moments])
-    floor = sum(float(link.nominal.center[0, 0, -1, -1]) for link in moments) + float(channel.noise.covariance[0, 0])
+    variance = np.array([float(spread[0, 0, 0, 0]) for spread in spreads])
+    floor = sum(float(spread[0, 0, -1, -1]) for spread in spreads) + float(channel.noise.covariance[0, 0])
     # The links' noise: D_ij = E[g_i] E[g_j] R_ij + (i = j) Var(g_i) t_i, with R the noise of the outputs that are sent
     # (`sensor_noise`) and t_i = E y_i^2 (`power`).
     outputs = [of_link[0] for of_link in channel.places]
@@ -76,7 +78,11 @@ def find_links_of_sum(node: Node, second: Float[np.ndarray, "m1 m1"]) -> tuple[S
 
 
 def _require_plain_sum(node: Node) -> tuple[LinearSensor, Superposed]:
-    """Return the sensor and the sum of links of a node; raise ValueError if the formulas of a design do not hold."""
+    """Return the sensor and the sum of links of a node; raise ValueError if the formulas of a design do not hold.
+
+    They hold for a linear sensor, and links of one hop each that carry one number, without memory, delays or uncertain
+    probabilities, to one sum.
+    """
     sensor, channel = node.sensor, node.channel
     if not isinstance(sensor, LinearSensor) or sensor.circular:
         raise _make_no_formula_error("a sensor that varies, is not linear or has angles")
@@ -106,8 +112,8 @@ def steady_covariance_with_information(
         information: J = H' H, as of a measurement H x with noise of covariance I; zero if nothing is received.
     """
     eigenvalues, vectors = np.linalg.eigh(information)
-    # An eigenvalue up to the share ALIKE of the largest counts as rounding.
-    is_above_rounding = eigenvalues > ALIKE * max(eigenvalues[-1], 0.0)
+    # An eigenvalue up to the share RELATIVE_ROUNDING of the largest counts as rounding.
+    is_above_rounding = eigenvalues > RELATIVE_ROUNDING * max(eigenvalues[-1], 0.0)
     if not is_above_rounding.any():
         return np.asarray(scipy.linalg.solve_discrete_lyapunov(matrix, process))
     H = (vectors[:, is_above_rounding] * np.sqrt(eigenvalues[is_above_rounding])).T

@@ -43,6 +43,7 @@ def steady_covariance(transition: Float[Array, "n n"], process: Float[Array, "n 
         ValueError: a plant that is not stable (where A is traced nobody can see it).
     """
     a = transition
+    # Traced by JAX: as the steady moments of a jump system of one step and one mode, whose axes lead.
     if is_traced(a, process):
         one_mode = JumpSystem(np.ones((1, 1, 1)), jnp.asarray(a)[None, None], jnp.asarray(process)[None, None])
         return jnp.asarray(one_mode.steady()[0, 0])
@@ -80,7 +81,9 @@ def require_design_plant(plant: AnyPlant) -> LinearPlant:
 
 
 def steady_moment_with_one(plant: AnyPlant) -> Float[Array, "n1 n1"]:
-    """Return the second moment E (x, 1)(x, 1)' in the steady state of a plant without inputs.
+    """Return E (x, 1)(x, 1)' (n + 1, n + 1) of the state x in the steady state of a plant without inputs.
+
+    It holds second moments, means and 1: [[E x x', E x], [E x', 1]]. Powers of what is sent are made of it.
 
     Raises:
         ValueError: a plant that varies or is not stable.
@@ -135,7 +138,13 @@ def _compute_noise_moments(plant: LinearPlant, u: Float[np.ndarray, "inputs"]) -
 
 
 def measured_moment_with_one(sensor: AnySensor, second: Float[Array, "n1 n1"], step: int = 0) -> Float[Array, "m1 m1"]:
-    """Return the second moment E (y, 1)(y, 1)' of a linear sensor from that of the state."""
+    """Return E (y, 1)(y, 1)' (m + 1, m + 1) of what a linear sensor measures, y = C x + v.
+
+    Args:
+        sensor: the sensor, or one over time.
+        second: E (x, 1)(x, 1)' of the state x.
+        step: the step, for a sensor that varies over time.
+    """
     sensor_now = at(sensor, step)
     matrix, noise = sensor_now.matrix, sensor_now.noise
     extended_matrix = _append_shift(matrix, noise.mean)  # from (x, 1) to (y, 1) without noise
@@ -145,7 +154,14 @@ def measured_moment_with_one(sensor: AnySensor, second: Float[Array, "n1 n1"], s
 
 
 def _append_shift(matrix: Float[Array, "m n"], shift: Float[Array, "m"]) -> Float[Array, "m1 n1"]:
-    """Return the matrix (m + 1, n + 1) of the map from (x, 1) to (M x + shift, 1)."""
+    """Return the matrix (m + 1, n + 1) of the map from (x, 1) to (M x + shift, 1).
+
+    It is [[M, shift], [0, 1]].
+
+    Args:
+        matrix: M (m, n).
+        shift: (m,).
+    """
     n = matrix.shape[1]
     row_of_one = np.eye(1, n + 1, n)  # (0, ..., 0, 1), which keeps the 1
     xp = library(matrix, shift)
@@ -155,7 +171,7 @@ def _append_shift(matrix: Float[Array, "m n"], shift: Float[Array, "m"]) -> Floa
 
 
 def _make_second_moment(mean: Float[Array, "n"], covariance: Float[Array, "n n"]) -> Float[Array, "n1 n1"]:
-    """Return E[(x, 1) (x, 1)'] from mean and covariance of x."""
+    """Return E (x, 1)(x, 1)' = (m, 1)(m, 1)' + [[P, 0], [0, 0]] from the mean m (n,) and covariance P (n, n) of x."""
     xp = library(mean, covariance)
     extended = xp.append(mean, 1.0)
     second: Array = xp.outer(extended, extended) + xp.pad(covariance, ((0, 1), (0, 1)))

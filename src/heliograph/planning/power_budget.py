@@ -9,8 +9,8 @@ from heliograph.numerics.check import fail, instance, scalar, table
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import ArrayLike, Bool, Float
 
-MET = 1e-9  # relative excess over a limit that counts as met
-AT_LIMIT = 1e-6  # relative: a power so near to its limit has reached it
+MET_EXCESS = 1e-9  # relative excess over a limit that counts as met
+NEAR_LIMIT = 1e-6  # relative: a power so near to its limit has reached it
 
 Powers = Float[np.ndarray, "time free"]
 PerTransmitter = float | dict[str, float] | None
@@ -61,7 +61,12 @@ def make_budget(value: object) -> Budget:
 
 
 def _read_limit(name: str, value: ArrayLike | Mapping[str, float] | None) -> PerTransmitter:
-    """Return a checked limit of powers: a number for all transmitters, {name: number} for some, or None for none."""
+    """Return a checked limit of powers: a number for all transmitters, {name: number} for some, or None for none.
+
+    Args:
+        name: name of the limit, for messages.
+        value: a number, {name: number} or None, as the user gives it.
+    """
     if value is None:
         return None
     if isinstance(value, Mapping):
@@ -71,10 +76,12 @@ def _read_limit(name: str, value: ArrayLike | Mapping[str, float] | None) -> Per
 
 
 class PowerLimits(NamedTuple):
-    """Polytope of the powers p >= 0 (time, free transmitter) that a budget allows.
+    """Limits of the powers p >= 0 (time, free transmitter) that a budget allows; infinite where nothing limits.
 
-    peak: of each entry; mean: of the mean over time of each column; total: of the mean over time of the sum. Infinite
-    where nothing limits.
+    Args:
+        peak: largest power of each transmitter at each step (time, free).
+        mean: largest mean over time of each transmitter's power (free,).
+        total: largest mean over time of the sum of all.
     """
 
     peak: Powers
@@ -145,7 +152,7 @@ class PowerLimits(NamedTuple):
             worth: the error that a watt more of each takes away at each step (time, free).
             is_least_power: whether the total itself is what was made small.
         """
-        has_room = (powers < self.peak * (1 - AT_LIMIT)) & (powers.mean(axis=0) < self.mean * (1 - AT_LIMIT))
+        has_room = (powers < self.peak * (1 - NEAR_LIMIT)) & (powers.mean(axis=0) < self.mean * (1 - NEAR_LIMIT))
         if not is_least_power and not np.isfinite(self.total):
             has_room[:] = True
         return float(np.max(worth * len(worth), where=has_room, initial=0.0))
@@ -207,15 +214,26 @@ def make_power_limits(
 def _check_fixed_powers(what: str, power: float, limit: float) -> None:
     """Raise ValueError if transmitters that are not free already send more than a limit.
 
-    `what`: the limit, in words. A limit counts as met within the rounding MET.
+    A limit counts as met within the rounding MET_EXCESS.
+
+    Args:
+        what: the limit, in words.
+        power: what these transmitters send.
+        limit: the limit.
     """
-    if power > limit * (1 + MET):
+    if power > limit * (1 + MET_EXCESS):
         expected = f"a {what} of at least {power:.6g}, which is sent by what is not free"
         raise fail("budget", expected, f"{limit:.6g}")
 
 
 def _list_limits(kind: str, limit: PerTransmitter, names: Sequence[str]) -> Float[np.ndarray, "hop"]:
-    """Return a limit for each transmitter in the order of `names`, infinite if it has none."""
+    """Return a limit for each transmitter in the order of `names`, infinite if it has none.
+
+    Args:
+        kind: name of the limit, for messages.
+        limit: a number for all, {name: number} for some, or None.
+        names: names of the transmitters.
+    """
     if not isinstance(limit, dict):
         return np.full(len(names), np.inf if limit is None else limit)
     unknown = sorted(set(limit) - set(names))

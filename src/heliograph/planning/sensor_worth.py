@@ -122,7 +122,8 @@ def worth_of_sensors(
             or additions with triggers, words or feedback, relays that filter, a single run.
     """
     instance("network", network, Network, "a Network")
-    nodes, added = _require_plain_nodes(network), table("additions", additions or {}, "nodes")
+    nodes = _require_plain_nodes(network)
+    added = table("additions", additions or {}, "nodes")
     if taken := [name for name in added if name in nodes]:
         raise fail("additions", "nodes of other names than the network's", taken[0])
     check_count("steps", steps)
@@ -136,7 +137,8 @@ def worth_of_sensors(
     # Of fewer than two runs no spread is known.
     drawn = monte_carlo(Network(network.plant, bare), steps, check_count("runs", runs, 2), key, inputs=inputs)
     u = np.zeros((steps, 0)) if inputs is None else np.asarray(inputs, float)
-    z, truth = np.concatenate([drawn.measurements[name] for name in bare], axis=-1), np.asarray(drawn.truth)
+    z = np.concatenate([drawn.measurements[name] for name in bare], axis=-1)
+    truth = np.asarray(drawn.truth)
     # The error of each case, in which what is not used is NaN. The first case is that of all nodes.
     sizes = [bare[name].received for name in bare]
     errors: list[ErrorWithout] = []
@@ -220,7 +222,12 @@ def _list_cases(
 
 
 def _make_filter_of_all(network: Network, nodes: Mapping[str, Node]) -> AbstractFilter:
-    """Return the likelihood filter of everything the nodes receive, linear if plant and sensors are, without angles."""
+    """Return the likelihood filter of everything the nodes receive, linear if plant and sensors are, without angles.
+
+    Args:
+        network: the network, for its plant.
+        nodes: the nodes that are received, by name.
+    """
     # The filter skips what is lost (NaN), so a channel without memory is taken given arrival. A channel with memory,
     # such as bursts, stays as it is, since one loss changes the probability of the next.
     plant = network.plant
@@ -247,24 +254,30 @@ def _compute_squares_at_end(
 ) -> Float[np.ndarray, "runs n"]:
     """Return the squared error of each state after the last step of each run (runs, n), or if `exact` its variance.
 
-    `filter` runs over simulated measurements `z` with inputs `u`; `truth` has the true states. `exact`: its covariance
-    is true, so that variances are taken in place of squared errors, which scatter. If variances are the same in all
-    runs, only the first run is computed and returned (1, n).
+    If variances are the same in all runs, only the first run is computed and returned (1, n).
+
+    Args:
+        filter: the filter of all nodes.
+        z: simulated measurements (runs, steps, received), NaN where something is lost or left out.
+        u: inputs (steps, inputs).
+        truth: true states (runs, steps, n).
+        exact: whether the filter's covariance is true, so that variances are taken in place of squared errors, which
+            scatter.
     """
-    squares, used = [], filter.angles_used()
+    squares, angles = [], filter.angles_used()
     # Variances depend on which outputs arrive, and on gains or noise variances that are reported with each message
     # (`numbers`), not on measured values. If both are the same in all runs, so are the variances.
     reported = find_told_filter(filter)
     is_reported = np.isin(np.arange(z.shape[-1]), () if reported is None else reported.numbers)
     deciding = np.where(is_reported, z, np.isnan(z))
     alike = exact and np.array_equal(deciding, np.broadcast_to(deciding[:1], z.shape), equal_nan=True)
-    for row, x in zip(z, truth, strict=True):
-        filtered = filter.run(row, u)
+    for z_of_run, x in zip(z, truth, strict=True):
+        filtered = filter.run(z_of_run, u)
         if exact:
             squares.append(np.diagonal(filtered.covariances[-1]))
         else:
             # Errors of angles are within half a turn.
-            squares.append(wrap_angles(filtered.means[-1] - x[-1], used.states if used else ()) ** 2)
+            squares.append(wrap_angles(filtered.means[-1] - x[-1], angles.states if angles else ()) ** 2)
         if alike:
             break
     return np.array(squares)

@@ -27,7 +27,7 @@ from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 
 BATCHES = 20  # of runs, from whose spread the standard errors come
-SAME = 1e-9  # of the entries of a schedule that is to be that of a design
+SAME_ENTRIES = 1e-9  # of the entries of a schedule that is to be that of a design
 
 Sources = dict[str, tuple[AnySensor, Channel]]  # what sends, by the beginning of its transmitters' names
 Moments = Float[np.ndarray, "batch steps m1 m1"]  # E (y, 1)(y, 1)'
@@ -37,9 +37,11 @@ Moments = Float[np.ndarray, "batch steps m1 m1"]  # E (y, 1)(y, 1)'
 class SentPower(Module):
     """Power that each transmitter sends, in the units of the sensor's output squared.
 
-    over_time: mean square at each step by name, (steps,), one step if steady; standard_error of it, zero where it is
-    exact. growth: spectral radius squared of a linear plant, the factor by which power grows in the long run at each
-    step where it is above 1; NaN where the plant is not linear, or every sensor sends its innovation.
+    Args:
+        over_time: mean square at each step by name, (steps,), one step if steady.
+        standard_error: its standard error, likewise; zero where it is exact.
+        growth: spectral radius squared of a linear plant, the factor by which power grows in the long run at each step
+            where it is above 1; NaN where the plant is not linear, or every sensor sends its innovation.
     """
 
     over_time: dict[str, Float[np.ndarray, "steps"]]
@@ -63,9 +65,9 @@ class SentPower(Module):
 
     @property
     def words(self) -> str:
-        """Sentence on whether the power stays bounded.
+        """Sentence on whether the power stays bounded in the long run, from its `growth`.
 
-        `self.growth`: the factor of the power from step to step in the long run. It is NaN or 1 if it is not known.
+        A growth of NaN or 1 tells nothing of it.
         """
         if np.isnan(self.growth) or self.growth == 1:
             return "what is sent is known for these steps only"
@@ -114,14 +116,7 @@ def power(
     steps = 1 if horizon is None else check_horizon(horizon, covered)
     shape = steps, len(plant.inputs)
     u = np.zeros(shape) if inputs is None else array("inputs", inputs, shape)
-    # E (y, 1)(y, 1)' of what each sensor sends: exact, or the mean of drawn trajectories.
-    if _is_exact(network, sources):
-        moments = _compute_moments(network.plant, sources, u, horizon)
-    elif horizon is None:
-        raise fail("power", "a horizon, since plant or sensor is not linear", "none")
-    else:
-        runs, seed = check_count("runs", runs, BATCHES), check_seed("seed", seed)
-        moments = _draw_moments(network.plant, sources, u, runs, seed)
+    moments = _find_output_moments(network, sources, u, horizon, runs, seed)
     # A sensor with feedback sends its innovation, which stays bounded or not whatever the plant does.
     informed = _find_feedback_filters(network)
     for name, informing in informed.items():
@@ -139,8 +134,36 @@ def power(
     return SentPower(over_time=over_time, standard_error=standard_error, growth=growth)
 
 
+def _find_output_moments(
+    network: Network, sources: Sources, inputs: Float[np.ndarray, "steps u"], horizon: int | None, runs: int, seed: int
+) -> dict[str, Moments]:
+    """Return E (y, 1)(y, 1)' of what each sensor measures: exact for linear models, else means of drawn trajectories.
+
+    Args:
+        network: the network, for its plant.
+        sources: sensor and channel by node.
+        inputs: inputs of the plant (steps, inputs).
+        horizon: number of steps from the initial law on; None for the steady state.
+        runs: number of drawn trajectories.
+        seed: of the draws.
+
+    Raises:
+        ValueError: no horizon where trajectories are drawn, too few of them.
+    """
+    if _is_exact(network, sources):
+        return _compute_moments(network.plant, sources, inputs, horizon)
+    if horizon is None:
+        raise fail("power", "a horizon, since plant or sensor is not linear", "none")
+    return _draw_moments(network.plant, sources, inputs, check_count("runs", runs, BATCHES), check_seed("seed", seed))
+
+
 def _is_exact(network: Network, sources: Sources) -> bool:
-    """Return whether second moments are exact without random draws: plant and sensors are linear without angles."""
+    """Return whether second moments are exact without random draws: plant and sensors are linear without angles.
+
+    Args:
+        network: the network, for its plant.
+        sources: sensor and channel by node.
+    """
     plant = network.plant
     all_are_linear = all(is_linear(plant, sensor) for sensor, _ in sources.values())
     have_angles = first(plant).circular or any(first(sensor).circular for sensor, _ in sources.values())
@@ -150,7 +173,14 @@ def _is_exact(network: Network, sources: Sources) -> bool:
 def _compute_moments(
     plant: AnyPlant, sources: Sources, inputs: Float[np.ndarray, "steps u"], horizon: int | None
 ) -> dict[str, Moments]:
-    """Return E (y, 1)(y, 1)' of each sensor's output (1, steps, m1, m1), as one batch, for a linear plant."""
+    """Return E (y, 1)(y, 1)' of each sensor's output (1, steps, m1, m1), as one batch, for a linear plant.
+
+    Args:
+        plant: the plant.
+        sources: sensor and channel by node.
+        inputs: inputs of the plant (steps, inputs).
+        horizon: number of steps from the initial law on; None for the steady state.
+    """
     seconds = [steady_moment_with_one(plant)] if horizon is None else moments_with_one_over(plant, len(inputs), inputs)
     return {
         name: np.array([[measured_moment_with_one(sensor, x, k) for k, x in enumerate(seconds)]])
@@ -161,13 +191,26 @@ def _compute_moments(
 def _compute_hop_powers(
     channel: Channel, moments: Moments, horizon: int | None
 ) -> dict[str, Float[np.ndarray, "batch steps"]]:
-    """Return {hop: powers (batch, steps)} of a channel's hops, from the moments E (y, 1)(y, 1)' of its input."""
+    """Return {hop: powers (batch, steps)} of a channel's hops, from the moments E (y, 1)(y, 1)' of its input.
+
+    Args:
+        channel: the channel, which may vary over time.
+        moments: E (y, 1)(y, 1)' of its input (batch, steps, m1, m1).
+        horizon: number of steps; None for the steady state.
+    """
     batches = [[_compute_powers_at(channel, k, now, horizon) for k, now in enumerate(batch)] for batch in moments]
     return {hop: np.array([[now[hop] for now in batch] for batch in batches]) for hop in batches[0][0]}
 
 
 def _compute_powers_at(channel: Channel, k: int, moment: np.ndarray, horizon: int | None) -> dict[str, float]:
-    """Return each hop's power at step k for `moment` = E (y, 1)(y, 1)', or in the long run if `horizon` is None."""
+    """Return each hop's power at step k for `moment` = E (y, 1)(y, 1)', or in the long run if `horizon` is None.
+
+    Args:
+        channel: the channel, which may vary over time.
+        k: the step.
+        moment: E (y, 1)(y, 1)' of its input at this step.
+        horizon: number of steps; None for the steady state.
+    """
     link, _, reported = separate_told_numbers(at(channel, k))
     if reported:  # a link whose gain or noise variance is reported with each message sends the same power
         if not has_untold_law(link):
@@ -207,11 +250,19 @@ def _compute_innovation_moments(
 
     y is the measurement and r its prediction by the filter at the receiver, fed back to the sensor. So d is an
     innovation: E d = 0 and E d d' = C P C' + R. P does not depend on data, so the filter is run over zeros.
+
+    Args:
+        filter: the filter at the receiver.
+        inputs: inputs of the plant (steps, inputs).
+        horizon: number of steps, which has to be given.
     """
     if horizon is None or filter.claim != "exact":
         expected = "a horizon and a linear model, whose filter knows its error before any data"
         raise fail("power of a sensor with feedback", expected, "no horizon" if horizon is None else filter.claim)
-    model, state, moments = filter.assumed, filter.init(), []  # the filter's model of plant and sensor
+    # the filter's model of plant and sensor
+    model = filter.assumed
+    state = filter.init()
+    moments = []
     assert model is not None and model.sensor is not None  # since it predicts a measurement
     for k, u in enumerate(inputs):
         state = filter.predict(state, u, k)
@@ -245,7 +296,8 @@ def _compute_relay_powers(network: Network, horizon: int | None) -> dict[str, Fl
     moved = relays.steps(steps)
     # The schedule's A and B have to be the plant's A and the rows of B that the relay expects. `expected_rows` has the
     # rows of all filters one after another, and those of a filter end at its entry of `ends`.
-    expected_rows, n = moved.predict_maps()[0], len(relays.states)
+    expected_rows = moved.predict_maps()[0]
+    n = len(relays.states)
     ends = dict(zip(relays.filters, np.cumsum(relays.received), strict=True))
     # What relays send does not depend on the receiver, whose gains may be zero; it is the last of `relays.received`.
     gains = {RECEIVER: np.zeros((steps, n, relays.received[-1]))}
@@ -253,7 +305,9 @@ def _compute_relay_powers(network: Network, horizon: int | None) -> dict[str, Fl
         gains[name] = np.asarray(schedule.gain)[:steps]
         expected = expected_rows[:, ends[name] - count : ends[name]]
         pairs = (schedule.transition, moved.transition), (schedule.expected, expected)
-        if not all(np.shape(a)[1:] == b.shape[1:] and np.allclose(a[:steps], b, SAME, SAME) for a, b in pairs):
+        if not all(
+            np.shape(a)[1:] == b.shape[1:] and np.allclose(a[:steps], b, SAME_ENTRIES, SAME_ENTRIES) for a, b in pairs
+        ):
             raise fail(f"schedule of {name!r}", "s+ = A s + K (z - B s - b), as relay_schedules makes them", "another")
     # The sensor (the first column of the slots) sends y where it transmits, of the power E y'y: the trace of E y y',
     # which E (y, 1)(y, 1)' holds without its last row and column.
@@ -269,6 +323,13 @@ def _draw_moments(
     """Return E (y, 1)(y, 1)' of each sensor (batch, steps, m1, m1), as means over batches of drawn trajectories.
 
     There are BATCHES batches of equal size, whose differences show how exact the mean is.
+
+    Args:
+        plant: the plant.
+        sources: sensor and channel by node.
+        inputs: inputs of the plant (steps, inputs).
+        runs: number of trajectories.
+        seed: of the random numbers.
     """
     keys = jax.random.split(seed_key(seed), (BATCHES, runs // BATCHES))
     sensors = {name: sensor for name, (sensor, _) in sources.items()}
@@ -311,7 +372,8 @@ def _draw_output_squares(
         """Return the state after step k, and (y, 1)(y, 1)' of every sensor, which measures it then.
 
         `x`: the state before. `row`: number of the step, and the inputs. From outside: `key_of_steps`, the trajectory's
-        key, from which each step gets keys of its own, and `sensors` by name.
+        key, from which each step gets keys of its own, and `sensors` by name. `plant` is the plant, which may vary over
+        time.
         """
         k, u = row
         key_of_noise, *keys_of_sensors = jax.random.split(jax.random.fold_in(key_of_steps, k), 1 + len(sensors))
@@ -327,5 +389,6 @@ def _draw_output_squares(
 
     start = at(plant, 0).sample_initial(key_of_start)
     rows = (jnp.arange(len(inputs)), jnp.asarray(inputs))
-    over_time: dict[str, jax.Array] = jax.lax.scan(draw_step, start, rows)[1]
+    over_time: dict[str, jax.Array]
+    _, over_time = jax.lax.scan(draw_step, start, rows)
     return over_time

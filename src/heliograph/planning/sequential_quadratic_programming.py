@@ -16,18 +16,33 @@ from heliograph.numerics.types import Bool, Float
 
 Vector = Float[np.ndarray, "x"]
 
-ITERATIONS = 400
-FINE, COARSE = 1e-14, 1e-8  # relative change at which a descent ends, and that of many of which the best goes on
-ROUNDS = 4  # of a descent begun again where it ended, its Hessian forgotten, and of Newton's method
-FEASIBLE = 1e-7  # relative excess over a limit that counts as none
-ACTIVE = 1e-7  # relative: how near a limit is one that is reached
-SHIFT = 1e-5  # relative, of the differences of gradients that make a Hessian
+MOST_ITERATIONS = 400
+FINE_TOLERANCE = 1e-14  # relative change at which a descent ends
+COARSE_TOLERANCE = 1e-8  # that of many descents, of which only the best goes on
+MOST_ROUNDS = 4  # of a descent begun again where it ended, its Hessian forgotten, and of Newton's method
+FEASIBLE_EXCESS = 1e-7  # relative excess over a limit that counts as none
+ACTIVE_ROOM = 1e-7  # relative: how near a limit is one that is reached
+DIFFERENCE_WIDTH = 1e-5  # relative, of the differences of gradients that make a Hessian
 ROUNDING = 1e-14  # relative
 LEAST_SIZE = 1e-12  # unit of a value that is less, or 0, at the start
 
 
+class ValueAndSlope(NamedTuple):
+    """Value of a function of z at a point, and its gradient."""
+
+    value: float
+    slope: Vector
+
+
 class Evaluation(NamedTuple):
-    """Error and transmitted powers (all steps of all transmitters in one row) at a point, and their derivatives."""
+    """Error and transmitted powers of a design at a point x, and their derivatives.
+
+    Args:
+        error: the error.
+        error_slope: its gradient by x.
+        powers: powers of all transmitters at all steps, step after step (entries,).
+        power_slope: derivatives of the powers by x (entries, x).
+    """
 
     error: float
     error_slope: Vector
@@ -36,7 +51,14 @@ class Evaluation(NamedTuple):
 
 
 class PowerAndErrorLimits(NamedTuple):
-    """Limits rows @ powers <= most, with most 1 or 0, and error <= target if given; `steps` make the mean power."""
+    """Limits rows @ powers <= most, and error <= target if a target is given.
+
+    Args:
+        rows: a row for each limit, scaled so that the limit is 1, or 0 if nothing may be sent (limits, entries).
+        most: the limits, 1 or 0 (limits,).
+        target: target of the error; None if the error itself is minimised.
+        steps: number of steps, by which the sum of all powers is divided to the mean power.
+    """
 
     rows: Float[np.ndarray, "limits entries"]
     most: Float[np.ndarray, "limits"]
@@ -47,9 +69,14 @@ class PowerAndErrorLimits(NamedTuple):
 class DescentProblem(NamedTuple):
     """A design problem as a descent needs it.
 
-    low, high, unit: least and largest values of x, and its scale. sharpnesses: smoothings of the error, one after
-    another, the last the sharpest. evaluate: error, powers and derivatives at x with a smoothing; None where they grow
-    without limit. restore: x moved back into the limits, as far as rounding took it out of them.
+    Args:
+        low: least values of x.
+        high: largest values of x.
+        unit: scale of each number in x.
+        sharpnesses: smoothings of the error, one after another, the last the sharpest.
+        evaluate: function of x and a smoothing that returns error, powers and derivatives; None where they grow without
+            limit.
+        restore: function that moves x back into the limits, as far as rounding took it out of them.
     """
 
     low: Vector
@@ -58,6 +85,20 @@ class DescentProblem(NamedTuple):
     sharpnesses: Sequence[int | None]
     evaluate: Callable[[Vector, int | None], Evaluation | None]
     restore: Callable[[Vector], Vector]
+
+
+class NewtonStep(NamedTuple):
+    """Newton's step on a Lagrangian, value - multipliers' room.
+
+    Args:
+        step: change of z.
+        multipliers: multipliers of the active limits, in their order.
+        active: which limits are active: met with equality (limits,).
+    """
+
+    step: Vector
+    multipliers: Vector
+    active: Bool[np.ndarray, "limits"]
 
 
 class ScaledProgramme:
@@ -73,39 +114,52 @@ class ScaledProgramme:
     """
 
     def __init__(self, problem: DescentProblem, limits: PowerAndErrorLimits, sharpness: int | None, start: Vector):
-        """Prepare a descent from a start, in coordinates z = x / unit, with this smoothing of the error (`sharpness`).
+        """Prepare a descent from a start x, in coordinates z = x / unit.
 
-        `self.size`: the objective at the start. The objective is divided by it, so that it is about 1.
+        The objective is divided by `self.size`, its value at the start, so that it is about 1.
+
+        Args:
+            problem: the design problem.
+            limits: of powers, and of the error where there is a target.
+            sharpness: the smoothing of the error, None of a trace.
+            start: the start x.
         """
         self.problem, self.limits, self.sharpness = problem, limits, sharpness
         low, high = problem.low / problem.unit, problem.high / problem.unit
         self.bounds = Bounds(low, high)
-        self._last: tuple[bytes, Evaluation | None] = (b"", None)
+        self._last: tuple[bytes, Evaluation | None] = (b"", None)  # the last point, as bytes, and its evaluation
         self.size = 1.0
-        value = self.objective(start / problem.unit)[0]
+        value = self.objective(start / problem.unit).value
         self.size = max(value, LEAST_SIZE) if np.isfinite(value) else 1.0
 
     def evaluate_at(self, z: Vector) -> Evaluation | None:
-        """Return the evaluation at a point z = x / unit, or None if there is none; the last evaluation is cached."""
+        """Return the evaluation at a point z = x / unit, or None if there is none; the last evaluation is cached.
+
+        SciPy asks for the objective, the limits and their slopes at the same point one after another.
+        """
         point, (last_point, evaluation) = z.tobytes(), self._last
         if point != last_point:
             evaluation = self.problem.evaluate(np.asarray(z * self.problem.unit), self.sharpness)
             self._last = point, evaluation
         return evaluation
 
-    def objective(self, z: Vector) -> tuple[float, Vector]:
-        """Return the objective at z = x / unit over `self.size`, infinite without an evaluation, and its derivative.
+    def objective(self, z: Vector) -> ValueAndSlope:
+        """Return the objective at z = x / unit over `self.size`, infinite without an evaluation, and its gradient.
 
         The objective is the error, or the total mean power if there is a target error. Powers are summed over all
         steps, so their sum is divided by the number of steps.
         """
         evaluation = self.evaluate_at(z)
         if evaluation is None:
-            return np.inf, np.zeros_like(z)
+            return ValueAndSlope(np.inf, np.zeros_like(z))
+        # By z = x / unit the gradient is that by x times the unit.
+        unit = self.problem.unit
         if self.limits.target is None:
-            return evaluation.error / self.size, evaluation.error_slope * self.problem.unit / self.size
+            return ValueAndSlope(evaluation.error / self.size, evaluation.error_slope * unit / self.size)
         scale = self.limits.steps * self.size
-        return float(evaluation.powers.sum()) / scale, evaluation.power_slope.sum(axis=0) * self.problem.unit / scale
+        total = float(evaluation.powers.sum())
+        total_slope = evaluation.power_slope.sum(axis=0)
+        return ValueAndSlope(total / scale, total_slope * unit / scale)
 
     def limit_room(self, z: Vector) -> Float[np.ndarray, "limits"]:
         """Return the unused part of each limit at z, with the target error last; it is negative if a limit is exceeded.
@@ -113,7 +167,9 @@ class ScaledProgramme:
         Limits are scaled to 1 (or 0), so the parts are 1 - powers / limit, and 1 - error / target. All are -1 at a
         point without an evaluation, where the error grows without limit.
         """
-        rows, most, target = self.limits.rows, self.limits.most, self.limits.target
+        rows = self.limits.rows
+        most = self.limits.most
+        target = self.limits.target
         evaluation = self.evaluate_at(z)
         if evaluation is None:
             return np.full(len(most) + (target is not None), -1.0)
@@ -121,24 +177,35 @@ class ScaledProgramme:
         return room if target is None else np.append(room, 1 - evaluation.error / target)
 
     def limit_room_slope(self, z: Vector) -> Float[np.ndarray, "limits x"]:
-        """Return the derivative of `limit_room` by z, (limits, x)."""
-        rows, most, target = self.limits.rows, self.limits.most, self.limits.target
+        """Return the derivatives of `limit_room`, the unused part of each limit, by z (limits, x).
+
+        They are 0 at a point without an evaluation, where the error grows without limit.
+        """
+        rows = self.limits.rows
+        most = self.limits.most
+        target = self.limits.target
         evaluation = self.evaluate_at(z)
+        unit = self.problem.unit
         if evaluation is None:
             return np.zeros((len(most) + (target is not None), len(z)))
-        slope = -(rows @ evaluation.power_slope) * self.problem.unit
-        return slope if target is None else np.vstack([slope, -evaluation.error_slope * self.problem.unit / target])
+        slope = -(rows @ evaluation.power_slope) * unit  # by z = x / unit
+        return slope if target is None else np.vstack([slope, -evaluation.error_slope * unit / target])
 
     def is_feasible(self, z: Vector) -> bool:
-        """Return whether the point exists and meets the limits, to FEASIBLE."""
-        return self.evaluate_at(z) is not None and bool(np.all(self.limit_room(z) >= -FEASIBLE))
+        """Return whether the error is finite at z and the limits are met, up to the relative FEASIBLE_EXCESS (1e-7)."""
+        return self.evaluate_at(z) is not None and bool(np.all(self.limit_room(z) >= -FEASIBLE_EXCESS))
 
     def merit(self, z: Vector) -> float:
-        """Return the value of a feasible point, else infinite."""
-        return self.objective(z)[0] if self.is_feasible(z) else np.inf
+        """Return the objective at a point within the limits, and infinity beyond them, to compare points."""
+        return self.objective(z).value if self.is_feasible(z) else np.inf
 
     def descend(self, z: Vector, tolerance: float) -> Vector:
-        """Return the point where sequential quadratic programming ends, or the start if that is better."""
+        """Return the point where sequential quadratic programming ends, or the start if that is better.
+
+        Args:
+            z: the start, in units of each number.
+            tolerance: relative change of the objective at which a descent ends.
+        """
         constraints = []
         if len(self.limit_room(z)):
             constraints = [NonlinearConstraint(self.limit_room, 0.0, np.inf, self.limit_room_slope)]
@@ -151,24 +218,30 @@ class ScaledProgramme:
             return self._minimize(self.objective, within_limits, constraints, tolerance)
         return end if self.merit(end) < merit_at_start else z
 
-    def _compute_squared_excess(self, z: Vector) -> tuple[float, Vector]:
-        """Return the squared excess over the limits, and its derivative by z: what a way back into them minimises."""
-        broken = np.minimum(self.limit_room(z), 0.0)
-        return float(broken @ broken), 2 * broken @ self.limit_room_slope(z)
+    def _compute_squared_excess(self, z: Vector) -> ValueAndSlope:
+        """Return the sum of squared excesses over the limits, and its gradient: what a way back into them minimises."""
+        broken = np.minimum(self.limit_room(z), 0.0)  # minus the excess over each limit, 0 where it is met
+        return ValueAndSlope(float(broken @ broken), 2 * broken @ self.limit_room_slope(z))
 
     def _minimize(
         self,
-        function: Callable[[Vector], tuple[float, Vector]],
+        function: Callable[[Vector], ValueAndSlope],
         z: Vector,
         constraints: list[NonlinearConstraint],
         tolerance: float,
     ) -> Vector:
         """Return the end of SLSQP's minimisation of a function from z, within bounds and constraints.
 
-        `function`: z -> value and gradient. The end is moved to where the limits hold; it is z if it is not finite.
+        The end is moved back into limits that rounding broke (`restore`). If it is not finite, z is returned.
+
+        Args:
+            function: z -> value and gradient.
+            z: the start.
+            constraints: functions of z that have to be at least 0.
+            tolerance: relative change of the value at which the minimisation ends.
         """
         optimum = minimize(function, z, jac=True, method="SLSQP", bounds=self.bounds, constraints=constraints,
-                          options={"ftol": tolerance, "maxiter": ITERATIONS})  # fmt: skip
+                          options={"ftol": tolerance, "maxiter": MOST_ITERATIONS})  # fmt: skip
         end = np.clip(optimum.x, self.bounds.lb, self.bounds.ub)
         if not np.all(np.isfinite(end)):
             return z
@@ -183,46 +256,50 @@ class ScaledProgramme:
         only rounding, leaves the limits, or raises the objective plus a penalty on the active limits. After each,
         `restore` moves the point back into limits that rounding broke.
         """
-        for _ in range(ROUNDS):
+        for _ in range(MOST_ROUNDS):
             newton = self._solve_newton_step(z)
             if newton is None:
                 break
-            step, multipliers, active = newton
-            if np.all(np.abs(step) <= ROUNDING):
+            if np.all(np.abs(newton.step) <= ROUNDING):
                 break
             unit = self.problem.unit
-            end = self.problem.restore(np.clip(z + step, self.bounds.lb, self.bounds.ub) * unit) / unit
-            value, value_at_end = (self._compute_penalised_value(point, multipliers, active) for point in (z, end))
+            end = self.problem.restore(np.clip(z + newton.step, self.bounds.lb, self.bounds.ub) * unit) / unit
+            value, value_at_end = (self._compute_penalised_value(point, newton) for point in (z, end))
             if not (self.is_feasible(end) and value_at_end <= value * (1 + ROUNDING)):
                 break
             z = end
         return z
 
-    def _compute_penalised_value(self, z: Vector, multipliers: Vector, active: Bool[np.ndarray, "limits"]) -> float:
-        """Return the value plus the excess over the active limits, weighed by their multipliers."""
-        excess = np.maximum(-self.limit_room(z), 0.0)
-        return float(self.objective(z)[0] + np.maximum(multipliers, 0.0) @ excess[active])
+    def _compute_penalised_value(self, z: Vector, newton: NewtonStep) -> float:
+        """Return the objective at z plus the excess over the active limits, weighed by their multipliers.
 
-    def _solve_newton_step(self, z: Vector) -> tuple[Vector, Vector, Bool[np.ndarray, "limits"]] | None:
-        """Return the step d from z, the multipliers m of the active limits, and which limits are active.
+        `newton`: says which limits are active, and has their multipliers.
+        """
+        excess = np.maximum(-self.limit_room(z), 0.0)
+        return float(self.objective(z).value + np.maximum(newton.multipliers, 0.0) @ excess[newton.active])
+
+    def _solve_newton_step(self, z: Vector) -> NewtonStep | None:
+        """Return Newton's step d from z on the Lagrangian, with the multipliers m of the active limits.
 
         The value is minimised with room(z) >= 0 for each limit; a limit is active where its room is about 0. Over the
         variables at no bound d solves H d - A' m = -g and A d = -room, with the gradient g of the value, the slopes A
         of the active limits' room, and the Hessian H of the Lagrangian, value - m' room. None is returned where all
         variables are at bounds, or derivatives are not finite.
         """
-        index = np.flatnonzero((z > self.bounds.lb + ACTIVE) & (z < self.bounds.ub - ACTIVE))  # variables at no bound
+        is_at_no_bound = (z > self.bounds.lb + ACTIVE_ROOM) & (z < self.bounds.ub - ACTIVE_ROOM)
+        index = np.flatnonzero(is_at_no_bound)
         room = self.limit_room(z)
-        active = room <= ACTIVE
+        active = room <= ACTIVE_ROOM
         if not len(index):
             return None
         # A and g, by each variable over its own size.
         scale = np.where(z[index] != 0, np.abs(z[index]), 1.0)
         slopes = self.limit_room_slope(z)[active][:, index] * scale
-        gradient = self.objective(z)[1][index] * scale
-        # The multipliers with which A' m comes nearest to the gradient, and the Hessian of the Lagrangian with these.
-        multipliers = np.linalg.lstsq(slopes.T, gradient, rcond=None)[0]
-        hessian = self._differentiate_lagrangian(z, multipliers, active, index, scale)
+        gradient = self.objective(z).slope[index] * scale
+        # First multipliers, with which A' m comes nearest to the gradient, for the Hessian of the Lagrangian. The step
+        # is solved for together with new multipliers, which are returned.
+        first_multipliers = np.linalg.lstsq(slopes.T, gradient, rcond=None)[0]
+        hessian = self._differentiate_lagrangian(z, first_multipliers, active, index, scale)
         # The equations of Karush, Kuhn and Tucker on the active limits, with H made symmetric.
         system = np.block([[(hessian + hessian.T) / 2, -slopes.T], [slopes, np.zeros((len(slopes), len(slopes)))]])
         right = np.concatenate([-gradient, -room[active]])
@@ -232,7 +309,7 @@ class ScaledProgramme:
         solution = np.linalg.lstsq(system, right, rcond=ROUNDING)[0]
         step = np.zeros_like(z)
         step[index] = scale * solution[: len(index)]
-        return step, solution[len(index) :], active
+        return NewtonStep(step=step, multipliers=solution[len(index) :], active=active)
 
     def _differentiate_lagrangian(
         self, z: Vector, multipliers: Vector, active: Bool[np.ndarray, "limits"], index: np.ndarray, scale: Vector
@@ -253,32 +330,45 @@ class ScaledProgramme:
         def lagrangian_gradient(point: Vector) -> Vector:
             """Return the gradient of value - m' room by the variables `index`, in units of `scale`.
 
-            m are the `multipliers` of the `active` limits.
+            m are the `multipliers` of the `active` limits. It is that of the objective less m times the slopes of the
+            active limits' room.
             """
-            gradient, slopes = self.objective(point)[1], self.limit_room_slope(point)[active]
+            gradient = self.objective(point).slope
+            slopes = self.limit_room_slope(point)[active]
             return np.asarray((gradient - multipliers @ slopes)[index] * scale)
 
-        at_z, hessian = lagrangian_gradient(z), np.empty((len(index), len(index)))
+        at_z = lagrangian_gradient(z)
+        hessian = np.empty((len(index), len(index)))
         for column, variable in enumerate(index):
             shift = np.zeros_like(z)
-            shift[variable] = SHIFT * scale[column]
-            hessian[:, column] = (lagrangian_gradient(z + shift) - at_z) / SHIFT
+            shift[variable] = DIFFERENCE_WIDTH * scale[column]
+            hessian[:, column] = (lagrangian_gradient(z + shift) - at_z) / DIFFERENCE_WIDTH
         return hessian
 
 
 def search_from_starts(problem: DescentProblem, limits: PowerAndErrorLimits, starts: Sequence[Vector]) -> Vector | None:
-    """Return the best end x of descents from these points x, refined and polished; None where none meets the limits."""
-    points, sharpest = [start / problem.unit for start in starts], problem.sharpnesses[-1]
-    # Coarse descents from everywhere, the largest eigenvalue sharper and sharper.
+    """Return the best end x of descents from several starts, or None if none of them meets the limits.
+
+    Coarse descents go from all starts. From the best end a fine one goes on, and Newton's method makes it exact.
+
+    Args:
+        problem: the design problem.
+        limits: of powers, and of the error where there is a target.
+        starts: points x, in the problem's own units.
+    """
+    points = [start / problem.unit for start in starts]
+    sharpest = problem.sharpnesses[-1]
+    # Coarse descents from everywhere, the largest eigenvalue sharper and sharper. From a single start the fine descent
+    # below is the only one with the sharpest.
     for sharpness in problem.sharpnesses if len(points) > 1 else problem.sharpnesses[:-1]:
         programmes = [ScaledProgramme(problem, limits, sharpness, z * problem.unit) for z in points]
-        points = [programme.descend(z, COARSE) for programme, z in zip(programmes, points, strict=True)]
+        points = [programme.descend(z, COARSE_TOLERANCE) for programme, z in zip(programmes, points, strict=True)]
     programme = ScaledProgramme(problem, limits, sharpest, points[0] * problem.unit)
     best = min(points, key=programme.merit)
     # A fine descent from the best, begun again as long as that helps.
-    for _ in range(ROUNDS):
+    for _ in range(MOST_ROUNDS):
         before = programme.merit(best)
-        best = programme.descend(best, FINE)
-        if not np.isinf(before) and not programme.merit(best) < before * (1 - FINE):
+        best = programme.descend(best, FINE_TOLERANCE)
+        if not np.isinf(before) and not programme.merit(best) < before * (1 - FINE_TOLERANCE):
             break
     return programme.polish_by_newton(best) * problem.unit if programme.is_feasible(best) else None

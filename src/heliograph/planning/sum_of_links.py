@@ -19,12 +19,20 @@ from heliograph.numerics.check import fail
 from heliograph.numerics.types import Float
 
 Vector = Float[np.ndarray, "links"]
-ALIKE = 1e-12  # relative: rows of one signal, noises that are independent
-HALVINGS = 200  # of an interval that holds a multiplier or a power
+RELATIVE_ROUNDING = 1e-12  # relative: rows of one signal, noises that are independent
+BISECTIONS = 200  # of an interval that holds a multiplier or a power
 
 
 class SummedLinks(NamedTuple):
-    """Links of a sum: rows B, noise D, power t of a unit amplitude, noise N, and the amplitudes at present."""
+    """Links of a sum z = sum_i a_i g_i y_i + noise, with amplitudes a_i, random gains g_i and sensor outputs y_i.
+
+    Args:
+        rows: B, with the row E[g_i] c_i for link i: what it carries of the state (links, n).
+        noise: D, covariance of what the links add to the sum before the receiver, at amplitudes 1 (links, links).
+        unit: t, the power E y_i^2 that each link sends at amplitude 1 (links,).
+        floor: N, variance of the noise of receiver and links that does not depend on the amplitudes.
+        present: amplitudes at present (links,).
+    """
 
     rows: Float[np.ndarray, "links n"]
     noise: Float[np.ndarray, "links links"]
@@ -71,7 +79,7 @@ def find_amplitudes_by_formula(links: SummedLinks, total: float, caps: Vector) -
     """
     # Formulas are known for one signal: then B has rank 1, and its rows are multiples b_i of one direction.
     _, singular_values, right = np.linalg.svd(links.rows)
-    if len(singular_values) > 1 and singular_values[1] > ALIKE * singular_values[0]:
+    if len(singular_values) > 1 and singular_values[1] > RELATIVE_ROUNDING * singular_values[0]:
         return None
     b = links.rows @ right[0]
     # Where only the total P binds: a ~ (D + N T / P)^-1 b, scaled to send P.
@@ -82,7 +90,7 @@ def find_amplitudes_by_formula(links: SummedLinks, total: float, caps: Vector) -
             return np.asarray(uncapped)
     # Under limits of each amplitude there is a formula only if the links' noises are independent, D diagonal.
     variances = np.diagonal(links.noise)
-    if np.any(np.abs(links.noise - np.diag(variances)) > ALIKE * np.sqrt(np.outer(variances, variances))):
+    if np.any(np.abs(links.noise - np.diag(variances)) > RELATIVE_ROUNDING * np.sqrt(np.outer(variances, variances))):
         return None
     # Where only the limits of each bind.
     capped: np.ndarray = np.sign(b) * _cap_amplitudes(np.abs(b), variances, links.floor, caps)
@@ -118,7 +126,7 @@ def _cap_and_share_total(links: SummedLinks, b: Vector, variances: Vector, total
 
     # At `low` the links send more than P, at `high` at most P.
     low, high = 0.0, links.floor / total
-    for _ in range(HALVINGS):
+    for _ in range(BISECTIONS):
         nu = (low + high) / 2
         low, high = (nu, high) if amplitudes_at(nu) ** 2 @ links.unit > total else (low, nu)
     return amplitudes_at(high)
@@ -140,10 +148,14 @@ def _cap_amplitudes(b: Vector, noise: Vector, floor: float, caps: Vector) -> Vec
     ratio = np.divide(b, noise, out=np.full_like(b, np.inf), where=noise > 0)
 
     def amplitudes_at(theta: float) -> Vector:
+        """Return the amplitudes min(theta b_i / D_i, cap_i); 0 of a link without gain."""
         return np.asarray(np.where(b > 0, np.minimum(theta * ratio, caps), 0.0))
 
     def excess(theta: float) -> float:
-        """Return theta b' a - (a' D a + N), which rises with theta."""
+        """Return theta b' a - (a' D a + N), which rises with theta.
+
+        a are the best amplitudes for this theta, `noise` is the diagonal of D, and `floor` is N.
+        """
         a = amplitudes_at(theta)
         return theta * float(b @ a) - float(noise @ a**2) - floor
 
@@ -151,9 +163,9 @@ def _cap_amplitudes(b: Vector, noise: Vector, floor: float, caps: Vector) -> Vec
     low, high = 0.0, 1.0
     while excess(high) < 0:
         high *= 2
-        if high > 1 / ALIKE**2:
+        if high > 1 / RELATIVE_ROUNDING**2:
             raise fail("budget", "one that limits every transmitter that helps", "no limit")
-    for _ in range(HALVINGS):
+    for _ in range(BISECTIONS):
         middle = (low + high) / 2
         low, high = (middle, high) if excess(middle) < 0 else (low, middle)
     return amplitudes_at(high)

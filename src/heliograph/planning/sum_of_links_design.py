@@ -23,7 +23,13 @@ from heliograph.planning.plant_moments import (
     steady_moment_with_one,
 )
 from heliograph.planning.power_budget import PowerLimits, make_budget, make_power_limits, make_unlimited
-from heliograph.planning.sum_of_links import ALIKE, HALVINGS, SummedLinks, Vector, find_amplitudes_by_formula
+from heliograph.planning.sum_of_links import (
+    BISECTIONS,
+    RELATIVE_ROUNDING,
+    SummedLinks,
+    Vector,
+    find_amplitudes_by_formula,
+)
 from heliograph.planning.transmitters import (
     amplify_transmitter,
     find_free_transmitters,
@@ -36,7 +42,7 @@ from heliograph.random_affine.sum_of_maps import Superposed
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 
-SEARCHES = 30  # of a power that reaches a target: to 1e-9 of it
+BISECTIONS_BY_SEARCH = 30  # of a power that reaches a target: to 1e-9 of it
 DOUBLINGS = 100  # of a power without limit, until it reaches a target
 
 
@@ -45,9 +51,14 @@ class SumOfLinksTask(NamedTuple):
 
     An amplitude is the factor by which a link's transmitter multiplies what it measures.
 
-    links: rows, noises and amplitudes at present. limits: of the free links' powers. free: which links are. covariance:
-    J (n, n), the information of a step, -> steady error covariance; error: covariance -> the number to be small.
-    starts, seed: of searches.
+    Args:
+        links: what the links carry, their noises and their amplitudes at present.
+        limits: limits of the free links' powers.
+        free: which links are free (links,).
+        covariance: function of the information J of a step (n, n) that returns the steady error covariance (n, n).
+        error: function of the error covariance that returns the number to be small.
+        starts: number of starts of a search.
+        seed: of the starts that are drawn.
     """
 
     links: SummedLinks
@@ -89,12 +100,14 @@ class SumOfLinksTask(NamedTuple):
     def bound_error(self, total: float) -> float:
         """Return a lower bound of the error for all amplitudes with this total power of the free links.
 
-        It is the error with an information that none of them exceeds. `self.fixed`: power of the links that are not
-        free.
+        It is the error with an information that none of them exceeds. The links that are not free send the power
+        `self.fixed` besides.
         """
-        all_links = total + self.fixed
+        total_of_all_links = total + self.fixed
         states = self.links.rows.shape[1]
-        information = self.links.best_information(all_links) if all_links > 0 else np.zeros((states, states))
+        information = np.zeros((states, states))
+        if total_of_all_links > 0:
+            information = self.links.best_information(total_of_all_links)
         return self.error(self.covariance(information))
 
     def find_amplitudes_by_formula(self, total: float) -> Vector | None:
@@ -131,6 +144,7 @@ class SumOfLinksTask(NamedTuple):
             return amplitudes
 
         def error_at(x: Vector) -> float:
+            """Return the error with the amplitudes at x."""
             return self.compute_error(amplitudes_at(x))
 
         # Descend from `first`, if it is given, and from uniform draws in the box; keep the best end.
@@ -142,7 +156,8 @@ class SumOfLinksTask(NamedTuple):
         for point in points:
             result = scipy.optimize.minimize(error_at, point, method="L-BFGS-B", bounds=[(-1.0, 1.0)] * len(scale))
             if result.fun < least:
-                best, least = amplitudes_at(np.asarray(result.x)), float(result.fun)
+                best = amplitudes_at(np.asarray(result.x))
+                least = float(result.fun)
         return best
 
 
@@ -199,14 +214,20 @@ def _make_task(
 ) -> SumOfLinksTask:
     """Return the search: which links are free, the limits of their powers, and the error by a step's information.
 
-    `names`: of the links' transmitters, in the order of the links.
+    Args:
+        problem: budget, error or target error, and which transmitters are free.
+        plant: the plant.
+        process: its noise.
+        links: the links, with their present amplitudes.
+        names: names of the links' transmitters, in the order of the links.
     """
     free = find_free_transmitters(names, problem.free)
     limits = make_unlimited(1, int(free.sum()))
     if problem.budget is not None:
         sent = links.present**2 * links.unit
         limits = make_power_limits(make_budget(problem.budget), names, free, sent[None])
-    transition, noise = np.asarray(plant.matrix), np.asarray(process.covariance)
+    transition = np.asarray(plant.matrix)
+    noise = np.asarray(process.covariance)
     criterion = problem.criterion.criterion(plant.states)
     return SumOfLinksTask(
         links=links,
@@ -223,6 +244,10 @@ def _find_least_error_amplitudes(task: SumOfLinksTask, total: float) -> tuple[Ve
     """Return the amplitudes (links,) of least error at a total power of the free links, and their certificate.
 
     A formula gives them if it holds; otherwise they are searched for.
+
+    Args:
+        task: the links, their limits and the error.
+        total: power that the free links may send together.
     """
     solution = task.find_amplitudes_by_formula(total)
     if solution is not None:
@@ -240,18 +265,22 @@ def _find_least_power_amplitudes(task: SumOfLinksTask, target: float) -> tuple[V
     """Return the amplitudes (links,) of the least power that reach a target error, and the certificate.
 
     By bisection of the power of the free links, since the least error falls with it.
+
+    Args:
+        task: the links, their limits and the error.
+        target: the target error.
     """
     best, certificate = _find_amplitudes_that_reach(task, target)
     largest = float((best**2 * task.links.unit)[task.free].sum())
     low, high = 0.0, largest
-    for _ in range(HALVINGS if certificate.convex else SEARCHES):
+    for _ in range(BISECTIONS if certificate.convex else BISECTIONS_BY_SEARCH):
         middle = (low + high) / 2
         tried = _find_best_at_power(task, middle, best)
         if task.compute_error(tried) <= target:
             high, best = middle, tried
         else:
             low = middle
-        if high - low <= ALIKE * largest:
+        if high - low <= RELATIVE_ROUNDING * largest:
             break
     needed = float((best**2 * task.links.unit).sum())
     bound = needed if certificate.convex else _bound_least_power(task, target, needed)
@@ -259,7 +288,13 @@ def _find_least_power_amplitudes(task: SumOfLinksTask, target: float) -> tuple[V
 
 
 def _find_best_at_power(task: SumOfLinksTask, power: float, near: Vector) -> Vector:
-    """Return the best amplitudes at a power of the free links: by formula if it holds, else by descent from `near`."""
+    """Return the best amplitudes at a power of the free links: by formula if it holds, else by descent from `near`.
+
+    Args:
+        task: the links, their limits and the error.
+        power: power that the free links send together.
+        near: amplitudes at which a descent begins (links,).
+    """
     if not power > 0:
         return np.where(task.free, 0.0, task.links.present)
     solution = task.find_amplitudes_by_formula(power)
@@ -270,10 +305,14 @@ def _bound_least_power(task: SumOfLinksTask, target: float, needed: float) -> fl
     """Return the total power at which the lower bound of the error reaches the target; no less power can reach it.
 
     It is found by bisection of the free links' power, up to the total power `needed` that is known to reach the target.
-    `task.fixed`: power of the links that are not free.
+
+    Args:
+        task: the links, their limits and the error; `fixed` is the power of the links that are not free.
+        target: the target error.
+        needed: a total power of all links that reaches it.
     """
     low, high = 0.0, needed - task.fixed
-    for _ in range(HALVINGS):
+    for _ in range(BISECTIONS):
         middle = (low + high) / 2
         low, high = (low, middle) if task.bound_error(middle) <= target else (middle, high)
     return low + task.fixed
@@ -281,6 +320,10 @@ def _bound_least_power(task: SumOfLinksTask, target: float, needed: float) -> fl
 
 def _find_amplitudes_that_reach(task: SumOfLinksTask, target: float) -> tuple[Vector, Certificate]:
     """Return amplitudes that reach a target error: with all power within the limits, or doubled where none limits.
+
+    Args:
+        task: the links, their limits and the error.
+        target: the target error.
 
     Raises:
         ValueError: a target that is not reached.
@@ -295,7 +338,7 @@ def _find_amplitudes_that_reach(task: SumOfLinksTask, target: float) -> tuple[Ve
             break
         total = 2 * total
         found, certificate = _find_least_error_amplitudes(task, total)
-    if certificate.value > target * (1 + ALIKE):
+    if certificate.value > target * (1 + RELATIVE_ROUNDING):
         within = "whatever the power" if unlimited else "within the budget"
         raise fail("target error", f"at least {certificate.value:.6g}, the least found {within}", f"{target:.6g}")
     return found, certificate

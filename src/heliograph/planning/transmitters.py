@@ -23,7 +23,7 @@ from heliograph.random_affine.modes import joint_modes
 from heliograph.random_affine.moments.signal_path import ChannelPosition, Second, SignalMoment, Visit
 from heliograph.simulation.node import Node
 
-UNCHANGED = 1e-12  # change of a law in a step that counts as none
+UNCHANGED_LAW = 1e-12  # change of a law in a step that counts as none
 
 
 def require_plain_senders(what: str, nodes: Mapping[str, object]) -> None:
@@ -50,19 +50,31 @@ def visit_hops(channel: AbstractRandomAffine, visit: Visit, signal: SignalMoment
 
     The signal, E (y, 1)(y, 1)' of what the hop receives, is followed through maps without memory.
 
+    Args:
+        channel: the channel.
+        visit: function of the name of a hop, the hop, and the signal that it receives; returns what takes its place.
+        signal: E (y, 1)(y, 1)' of the channel's input; None if it is not needed.
+
     Raises:
         ValueError: a map of a kind whose transmitters are not known.
     """
-    return channel.visit_hops(visit, ChannelPosition("", 0, signal))[0]
+    visited, _ = channel.visit_hops(visit, ChannelPosition("", 0, signal))
+    return visited
 
 
 def transmitter_names(channel: AbstractRandomAffine) -> list[str]:
-    """Return the names of the transmitters, in order of appearance."""
+    """Return the names of the transmitters, in order of appearance.
+
+    A transmitter in several modes or alternatives of the channel is listed once.
+    """
     # A dict has each name once, like a set, but keeps the order.
     names: dict[str, None] = {}
 
     def note_name(name: str, hop: AbstractHop, signal: SignalMoment | None) -> AbstractHop:
-        """Note the hop's name, and leave the hop as it is."""
+        """Note the hop's name, and leave the hop as it is.
+
+        Names are keys of the dict `names`, in the order in which they come.
+        """
         names.setdefault(name)
         return hop
 
@@ -90,7 +102,12 @@ def select_transmitters(names: Sequence[str], chosen: Sequence[str], what: str) 
 def compute_sent_powers(channel: AbstractRandomAffine, second: Second, step: int = 0) -> dict[str, Any]:
     """Return the power (mean square of what is sent) of each transmitter at a step, by name.
 
-    The channel's modes have their law at this step, so the power is exact. `second`: E (y, 1)(y, 1)' of the input y.
+    The channel's modes have their law at this step, so the power is exact.
+
+    Args:
+        channel: the channel.
+        second: E (y, 1)(y, 1)' of its input y.
+        step: number of steps since the initial law of the modes.
 
     Raises:
         ValueError: a map of a kind whose transmitters are not known.
@@ -107,7 +124,7 @@ def compute_steady_powers(channel: AbstractRandomAffine, second: Second) -> dict
     `second`: E (y, 1)(y, 1)' of what goes into the channel.
     """
     joint = joint_modes(channel, order=2)
-    starts_stationary = np.allclose(joint.initial @ joint.transition, joint.initial, rtol=0.0, atol=UNCHANGED)
+    starts_stationary = np.allclose(joint.initial @ joint.transition, joint.initial, rtol=0.0, atol=UNCHANGED_LAW)
     law = joint.initial if starts_stationary else find_stationary_law(joint.transition)
     return compute_powers_of_law(channel, second, law)
 
@@ -169,6 +186,12 @@ def set_transmitter_powers(
 ) -> AbstractRandomAffine:
     """Return the channel whose named transmitters send these powers: each amplifies what it receives to its power.
 
+    Args:
+        channel: the channel.
+        second: E (y, 1)(y, 1)' of its input y.
+        powers: {name: power} of the transmitters that change.
+        step: the step, at which the channel's modes have their law.
+
     Raises:
         ValueError: a transmitter that receives nothing which it could amplify.
     """
@@ -186,7 +209,13 @@ def set_transmitter_powers(
 
 
 def amplify_transmitter(channel: AbstractRandomAffine, name: str, factor: float | None) -> AbstractRandomAffine:
-    """Return the channel in which a transmitter amplifies by this factor more; None: it sends just what it receives."""
+    """Return the channel in which a transmitter amplifies by this factor more; None: it sends just what it receives.
+
+    Args:
+        channel: the channel.
+        name: name of the transmitter.
+        factor: by which its amplitude is multiplied, or None.
+    """
 
     def amplify(hop_name: str, hop: AbstractHop, signal: SignalMoment | None) -> AbstractHop:
         """Return the hop called `name` with its matrix times `factor`, and any other hop as it is.

@@ -8,7 +8,8 @@ Smoother steps stay in the SIMD lane of their chunk.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +17,7 @@ import numpy as np
 
 from heliograph.engine.choice import choose_code
 from heliograph.factors.factored_gaussian import Gaussian
+from heliograph.filters.base import AbstractFilter
 from heliograph.filters.rows.chunks import (
     ChunkStarts,
     find_chunk_starts,
@@ -26,7 +28,6 @@ from heliograph.filters.rows.chunks import (
 from heliograph.filters.rows.gaussians_in_states import find_equal_states, select_state
 from heliograph.filters.rows.linear_recursion import initial_state_if_linear, scan_chunk
 from heliograph.filters.rows.row_windows import Which, take, take_windows
-from heliograph.filters.rows.settled_covariance import SettledState
 from heliograph.filters.smoother_step import SmootherStep, gaussian_of
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.types import Array, Float, PyTree
@@ -41,21 +42,24 @@ class SmoothedRows(NamedTuple):
     sums: Float[np.ndarray, "5"]
 
 
-def smooth_in_chunks(filter: Any, z: Array, u: Array) -> SmoothedRows | None:
-    """Smooth rows in chunks side by side; None if rows are few, or the filter is not linear or forgets too slowly.
+def smooth_in_chunks(filter: AbstractFilter, z: Array, u: Array) -> SmoothedRows | None:
+    """Smooth a long recording in chunks of rows that are computed in parallel; None if it cannot be divided so.
 
-    A filter forgets its start if any two states lead to the same state after enough rows.
+    A chunk may begin with any state some rows before its own, if the filter forgets its start: any two states lead to
+    the same state after enough rows. The result is None if rows are few, or the filter is not linear or forgets too
+    slowly; the caller then smooths row after row.
 
     Args:
         filter: the filter, which can be smoothed.
         z: measurements (rows, received), NaN for what did not arrive.
         u: inputs (rows, inputs).
     """
-    start, rows = initial_state_if_linear(filter), (np.asarray(z), np.asarray(u))
+    start = initial_state_if_linear(filter)
+    rows = (np.asarray(z), np.asarray(u))
     if start is None:
         return None
     with jax.enable_x64(True):
-        # The length of chunks, their own rows, is known only after their starts.
+        # How long chunks are is known only after their starts are found, which need no length (own=0).
         chunk_starts = find_chunk_starts(SmootherStepRecursion(filter, own=0), start, rows)
         if chunk_starts is None:
             return None
@@ -71,7 +75,7 @@ def smooth_chunk(
     later: Gaussian,
     is_given: Array,
 ) -> SmoothedChunk:
-    """Smooth a chunk's own rows by all data up to row `end`: filter ahead, then pass back.
+    """Smooth a chunk's own rows by all data before row `end`: a filter's pass ahead, then a smoother's pass back.
 
     Args:
         recursion: the filter over rows, and how many rows are the chunk's own.
@@ -83,6 +87,7 @@ def smooth_chunk(
         is_given: whether `later` is used.
     """
     own = recursion.own
+    # The smoother step of each row: of the chunk's own rows, and of the rows after them.
     state_at_end, steps = scan_chunk(recursion, state, take(rows, slice(own)), first, end)
     last_state, steps_after = scan_chunk(recursion, state_at_end, take(rows, slice(own, None)), first + own, end)
 
@@ -92,13 +97,16 @@ def smooth_chunk(
         return select_state(k < end, step.back(law), law), None
 
     def pass_back_and_estimate(law: Gaussian, item: tuple[SmootherStep, Array]) -> tuple[Gaussian, Estimate]:
-        """Return the smoothed law before a row from the smoothed `law` after it, and the row's smoothed estimate."""
+        """Return the smoothed law before a row from the smoothed `law` after it, and the row's smoothed estimate.
+
+        `pass_back` takes the law one row back.
+        """
         step, _k = item
         law_before, _ = pass_back(law, item)
         return law_before, step.estimate_from(law)
 
-    k = first + jnp.arange(len(rows[0]))
-    law = select_state(is_given, later, gaussian_of(last_state))
+    k = first + jnp.arange(len(rows[0]))  # row numbers
+    law = select_state(is_given, later, gaussian_of(last_state))  # the law with which the backward pass begins
     law_after, _ = jax.lax.scan(pass_back, law, (steps_after, k[own:]), reverse=True)
     law_before, estimate = jax.lax.scan(pass_back_and_estimate, law_after, (steps, k[:own]), reverse=True)
     return SmoothedChunk(
@@ -111,11 +119,12 @@ def smooth_chunk(
     )
 
 
-# Arguments: first states of chunks, which chunks, and the smoothed laws after them (the filtered ones if left out).
+# Smooths some chunks. Arguments: states before their first rows, which chunks they are, and the smoothed laws after
+# their last rows (if left out, the backward pass begins later, with the filtered law).
 SmoothChunks = Callable[..., SmoothedChunk | None]
 
 
-def _smooth_all(recursion: SmootherStepRecursion, begun: ChunkStarts, rows: PyTree) -> SmoothedRows | None:
+def _smooth_all(recursion: SmootherStepRecursion, chunk_starts: ChunkStarts, rows: PyTree) -> SmoothedRows | None:
     """Smooth all chunks side by side, then again those whose ends differ from their neighbours'.
 
     A chunk smooths its `own` rows by a window of these and the `ahead` rows after them. It filters its window and
@@ -124,49 +133,61 @@ def _smooth_all(recursion: SmootherStepRecursion, begun: ChunkStarts, rows: PyTr
 
     Args:
         recursion: one step of the filter and of its smoother.
-        begun: for each chunk its first row and a state to begin with, the numbers `own` and `ahead`, and whether
-            covariances have settled there: rows without missing numbers then change only means.
+        chunk_starts: for each chunk its first row and a state to begin with, the numbers `own` and `ahead`, and
+            whether covariances have settled there: rows without missing numbers then change only means.
         rows: measurements and inputs, (rows, ...) each.
 
     Returns:
         The smoothed estimates of all rows; None without native code for a chunk.
     """
-    total, (own, ahead) = len(rows[0]), begun.lengths
-    windows = take_windows(rows, begun.first, own + ahead)
-    window_ends = np.minimum(begun.first + own + ahead, total)
+    total = len(rows[0])
+    own, ahead = chunk_starts.lengths
+    windows = take_windows(rows, chunk_starts.first, own + ahead)
+    window_ends = np.minimum(chunk_starts.first + own + ahead, total)
 
     def smooth_chunks_from(states: PyTree, which: Which, later: Gaussian | None = None) -> SmoothedChunk | None:
         """Filter the chunks `which` from their first states, then smooth them; None without native code.
 
         The backward pass begins at the end of each chunk's window, which is before the row `window_ends`. If `later` is
-        given, the smoothed law after each chunk's own rows, it begins there.
+        given, the smoothed law after each chunk's own rows, it begins there. The numbers of first rows and the rows of
+        each chunk are in `chunk_starts` and `windows`; `recursion` is the filter over rows.
         """
-        first = begun.first[which]
+        first = chunk_starts.first[which]
         is_given = np.full(len(first), later is not None)
         if later is None:
-            pass_back_from, laws = window_ends[which], gaussian_of(states)  # these laws are not used
+            pass_back_from = window_ends[which]
+            laws = gaussian_of(states)  # these laws are not used
         else:
             pass_back_from, laws = first + own, later
         arguments = recursion, states, take(windows, which), first, pass_back_from, laws, is_given
         choice = choose_code(smooth_chunk, arguments, differs_by_run=[False, True, True, True, True, True, True])
         return None if choice.code is None else choice.results()
 
-    def smooth_means(settled: SettledState) -> SmoothedChunk | None:
-        """Smooth all chunks by their means alone, with the covariances and gains of `settled`."""
-        return smooth_settled_chunks(recursion, settled, begun, windows)
-
     # Only means are computed in chunks where covariances have settled: their window must be complete, and must not
     # reach beyond the last row.
-    is_complete = begun.complete.are_complete(begun.first, own + ahead) & (begun.first + own + ahead <= total)
-    begun = begun._replace(covered=begun.covered & is_complete)
-    results = scan_means_where_settled(begun, smooth_chunks_from, smooth_means)
+    first = chunk_starts.first
+    is_complete = chunk_starts.complete.are_complete(first, own + ahead) & (first + own + ahead <= total)
+    chunk_starts = chunk_starts._replace(covered=chunk_starts.covered & is_complete)
+    # A function of the settled state, by whose covariances and gains it smooths all chunks.
+    smooth_means = partial(smooth_settled_chunks, recursion, chunk_starts=chunk_starts, windows=windows)
+    results = scan_means_where_settled(chunk_starts, smooth_chunks_from, smooth_means)
     if results is None:
         return None
     # Results are repaired in place. From the first chunk on: each chunk that began in another state than that in which
     # the chunk before it ends. Then from the last one back: each chunk whose smoothed law at its end is wrong.
-    rescan_wrong_starts(smooth_chunks_from, begun.states, lambda results: results.end, results)
-    _resmooth_wrong_ends(smooth_chunks_from, begun.states, results)
-    leaves = results.estimate, results.nis, results.received  # (chunks, own, ...) each
+    rescan_wrong_starts(smooth_chunks_from, chunk_starts.states, lambda results: results.end, results)
+    _resmooth_wrong_ends(smooth_chunks_from, chunk_starts.states, results)
+    return _join_chunks(results, total)
+
+
+def _join_chunks(results: SmoothedChunk, total: int) -> SmoothedRows:
+    """Return the smoothed rows of all chunks, one after the other, without those that fill up the last chunk.
+
+    Args:
+        results: results of all chunks, with arrays (chunks, own, ...).
+        total: number of rows of the recording.
+    """
+    leaves = results.estimate, results.nis, results.received
     estimate, nis, received = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:total], leaves)
     return SmoothedRows(estimate, np.asarray(sum_nis_over_blocks(nis, received)))
 
@@ -179,13 +200,21 @@ def _resmooth_wrong_ends(smooth: SmoothChunks, states: PyTree, results: Smoothed
     latter law at its end. Chunks are taken from the last to the first, since this changes the chunk's own `law_before`,
     which is compared at the joint before it. A chunk is filtered again from the state in which the chunk before it
     ends, and the first one from its state in `states`.
+
+    Args:
+        smooth: smooths some chunks from their first states, and from the smoothed laws after them.
+        states: states with which the chunks began (chunks, ...).
+        results: results of all chunks (chunks, ...).
     """
-    laws_at_ends, laws_at_starts = take(results.law_after, slice(None, -1)), take(results.law_before, slice(1, None))
+    laws_at_ends = take(results.law_after, slice(None, -1))
+    laws_at_starts = take(results.law_before, slice(1, None))
     disagrees_with_next = ~find_equal_states(laws_at_ends, laws_at_starts)
     for c in range(len(disagrees_with_next) - 1, -1, -1):
         if not disagrees_with_next[c]:
             continue
-        previous_chunk, chunk, next_chunk = slice(c - 1, c), slice(c, c + 1), slice(c + 1, c + 2)
+        previous_chunk = slice(c - 1, c)
+        chunk = slice(c, c + 1)
+        next_chunk = slice(c + 1, c + 2)
         state = take(results.end, previous_chunk) if c else take(states, chunk)
         replace_chunk(results, chunk, smooth(state, chunk, take(results.law_before, next_chunk)))
         if c:

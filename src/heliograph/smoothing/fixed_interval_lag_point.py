@@ -47,9 +47,10 @@ def sum_nis_over_blocks(nis: Float[Array, " time"], received: Float[Array, " tim
     `nis` is the square e' S^-1 e of each step's innovation, and `received` the number of its components that arrived.
     The steps are cut into BLOCKS parts. Their scatter gives the standard error.
     """
-    xp, time = library(nis), len(nis)
+    xp = library(nis)  # NumPy or JAX
+    time = len(nis)
     count = min(BLOCKS, time)
-    edges = [-(-time * i // count) for i in range(count + 1)]  # rounded up
+    edges = [-(-time * i // count) for i in range(count + 1)]  # block i: rows edges[i] to edges[i + 1] - 1
     s, h = (xp.stack([xp.sum(values[begin:end]) for begin, end in pairwise(edges)]) for values in (nis, received))
     sums: Array = xp.stack([xp.sum(values) for values in (s, h, s * s, s * h, h * h)])
     return sums
@@ -73,7 +74,11 @@ def nis_test(sums: Float[np.ndarray, "5"]) -> tuple[float, float]:
 def warn_if_inconsistent(name: str, sums: Float[np.ndarray, "5"]) -> None:
     """Warn if a filter's squared innovations (NIS) are more than EXCESS times what its model predicts, beyond chance.
 
-    `sums` are the results of `nis_sums`. An excess of up to DEVIATIONS standard errors may be chance.
+    An excess of up to DEVIATIONS standard errors may be chance.
+
+    Args:
+        name: what warns, such as "smoothing".
+        sums: the five sums that `nis_sums` returns.
     """
     ratio, error = nis_test(sums)
     if ratio > EXCESS and ratio - 1 > DEVIATIONS * error:
@@ -101,7 +106,10 @@ class AbstractSmoothing(Module):
         return _sweep_compiled(self, steps)
 
     def sweep(self, steps: SmootherStep) -> Estimate:
-        """Compute the estimates of one run, like `estimates`, inside a compiled computation."""
+        """Return the estimates of one run from its smoother steps, like `estimates`, but traceable and without warning.
+
+        Each kind of smoothing says here how its passes go.
+        """
         raise unwritten(self, "sweep")
 
     def means(self, steps: SmootherStep) -> jax.Array:
@@ -118,7 +126,7 @@ class AbstractSmoothing(Module):
 
 @compile_on_call
 def _sweep_compiled(smoothing: AbstractSmoothing, steps: SmootherStep) -> Estimate:
-    """Go back over all steps; return the smoothed estimates: compiled body of `AbstractSmoothing.estimates`."""
+    """Return `smoothing.sweep(steps)`, the smoothed estimates, from compiled code."""
     return smoothing.sweep(steps)
 
 

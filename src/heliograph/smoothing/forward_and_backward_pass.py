@@ -62,6 +62,7 @@ def filter_rows_with_smoother_steps(
     """
 
     def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, SmootherStep]:
+        """Return the filter's state after a row (z, u, k), and the smoother step of this row."""
         return filter.step_with_smoother(state, *row)
 
     rows = jnp.asarray(z), jnp.asarray(u), jnp.asarray(first + jnp.arange(len(z)))
@@ -93,7 +94,11 @@ def data_free_smoother_steps(filter: AbstractFilter, inputs: Array) -> SmootherS
 
 
 def smooth_fixed_interval(steps: SmootherStep) -> Estimate:
-    """Estimate each step's state given all data, by one backward pass over smoother steps, stacked along time."""
+    """Estimate each step's state given all data, by one backward pass over smoother steps, stacked along time.
+
+    The pass begins with the filtered law after the last step, given which each step's law follows from that of the step
+    after it.
+    """
 
     def body(later: Gaussian, pair: tuple[SmootherStep, SmootherStep]) -> tuple[Gaussian, Estimate]:
         """Smooth the state between two steps from `later`, the smoothed law of the state after both.
@@ -111,7 +116,10 @@ def smooth_fixed_interval(steps: SmootherStep) -> Estimate:
 
 
 def smooth_fixed_interval_means(steps: SmootherStep) -> jax.Array:
-    """Return the mean (steps, n) of each step's state given all data, by one backward pass over smoother steps."""
+    """Return the mean (steps, n) of each step's state given all data, by one backward pass over smoother steps.
+
+    It is `smooth_fixed_interval` without covariances, where these are known from elsewhere.
+    """
 
     def body(later: jax.Array, pair: tuple[SmootherStep, SmootherStep]) -> tuple[jax.Array, jax.Array]:
         """Smooth the mean of the state between two steps from `later`, the smoothed mean of the state after both.
@@ -158,7 +166,8 @@ def smooth_fixed_lag(steps: SmootherStep, lag: int | Int[Array, ""]) -> Estimate
         chosen: Gaussian = jax.tree.map(choose, laws_before, laws)
         return chosen
 
-    filtered = take_steps(steps.end, jnp.minimum(k + lag, last))  # laws from which the passes begin
+    # The pass of step k begins with the filtered law after step k + lag, or after the last step.
+    filtered = take_steps(steps.end, jnp.minimum(k + lag, last))
     smoothed = jax.lax.fori_loop(0, lag, pass_one_step_back, filtered)
     estimate: Estimate = jax.vmap(lambda step, law: step.estimate_from(law))(steps, smoothed)
     return estimate
@@ -168,16 +177,20 @@ def smooth_fixed_point(steps: SmootherStep, step: int) -> Estimate:
     """Estimate the state x_j after the step number j = `step`, given the data up to it, and up to each later step.
 
     Returns the stacked estimates, one for each of these ends of the data.
+
+    Args:
+        steps: the filter's smoother steps, stacked along time.
+        step: number j of the step.
     """
     fixed_step = take_step(steps, step)
 
     def body(fixed_state: EarlierState, later_step: SmootherStep) -> tuple[EarlierState, Estimate]:
         """Update x_j by the data of a later step, and estimate it given all data up to there.
 
-        `fixed_state` is the regression of x_j on the present state: each later step first carries the regression to
-        the new present state.
+        `fixed_state` is the regression of x_j on the present state: each later step first carries the regression to the
+        new present state. `fixed_step` is the smoother step number j.
         """
-        updated = later_step.ahead(fixed_state)
+        updated = later_step.ahead(fixed_state)  # x_j regressed on the state after the later step
         law = later_step.find_law_of_earlier(updated)
         # Attitudes in `law` are rotation vectors from the filtered mean after step j.
         return updated, fixed_step.estimate_from(fixed_step.settle(law))
@@ -189,12 +202,15 @@ def smooth_fixed_point(steps: SmootherStep, step: int) -> Estimate:
 
 
 def _take_plant_mean(step: SmootherStep, mean: jax.Array) -> jax.Array:
-    """Return the mean of the plant's state, projection m + offset, for a mean m of the filter's state."""
+    """Return the mean of the plant's state, projection m + offset, for a mean m of the filter's state.
+
+    A filter's state may hold more than the plant's, such as delayed values or learned parameters.
+    """
     return jnp.asarray(step.estimate_from(step.after._replace(mean=mean)).mean)
 
 
 def _pair_with_next(steps: SmootherStep) -> tuple[SmootherStep, SmootherStep]:
-    """Pair each step with the one after it."""
+    """Return the steps k = 0 ... last - 1 and the steps k + 1, so that a scan sees each step with the next one."""
     return take_steps(steps, slice(None, -1)), take_steps(steps, slice(1, None))
 
 

@@ -129,19 +129,29 @@ def planned_smoother(
 
 @compile_on_call
 def _smoothed_means(planned: PlannedSmoother, z: Array) -> jax.Array:
-    """Return the smoothed means of one run's measurements (horizon, received)."""
-    _, steps = filter_rows_with_smoother_steps(planned.filter, z, planned.inputs, planned.filter.init(), np.asarray(0))
+    """Return the smoothed means (time, n) of one run's measurements z (horizon, received).
+
+    The planned filter has all covariances and gains, so that its pass over z computes only means.
+    """
+    first_step, start = np.asarray(0), planned.filter.init()
+    _, steps = filter_rows_with_smoother_steps(planned.filter, z, planned.inputs, start, first_step)
     return planned.smoothing.means(jax.tree.map(jnp.asarray, steps))
 
 
 @compile_on_call
 def _plan_or_none(filter: AbstractFilter, u: Array) -> AbstractFilter | None:
-    """Return the planned filter with its smoother steps; None where gains depend on data."""
+    """Return the filter with gains and smoother steps precomputed for inputs u (horizon, inputs) and complete data.
+
+    None where its gains depend on data.
+    """
     planned = plan_with_smoother_steps(filter, u)
     return None if planned is filter else planned
 
 
 @compile_on_call
 def _smoothed_covariances(filter: AbstractFilter, smoothing: AbstractSmoothing, u: Array) -> Estimate:
-    """Return the smoothed estimates for measurements of zero; their covariances hold for any data."""
+    """Return the smoothed estimates for z = 0.
+
+    Their covariances hold for any complete data, since the filter's gains depend on none. `u`: (horizon, inputs).
+    """
     return smoothing.sweep(data_free_smoother_steps(filter, u))

@@ -26,9 +26,10 @@ def simulation_smoother(
     """Draw paths of the states given all rows, from the law whose moments are the smoothed means and covariances.
 
     The last state is drawn from its filtered law, each one before from its law given the state drawn after it:
-    x_k = m + K (x_{k+1} - m-) + e, with the filtered mean m, the predicted mean m-, the smoother's gain K and a draw e
-    of zero mean. So each path as a whole is a draw, and answers how long a level was passed, or what the greatest
-    value was. For a linear Gaussian model the draws are exact.
+    x_k = m + J (x_{k+1} - m-) + e. Here m is the filtered mean of x_k, m- the predicted mean of x_{k+1}, J the
+    smoother's gain Cov(x_k, x_{k+1}) Cov(x_{k+1})^-1 given the data up to step k, and e a draw of zero mean. So each
+    path as a whole is a draw, and answers how long a level was passed, or what the greatest value was. For a linear
+    Gaussian model the draws are exact.
 
     Args:
         filter: a filter that can be smoothed; any that keeps a covariance.
@@ -56,9 +57,17 @@ def simulation_smoother(
 
 @compile_in_float64
 def _draw_paths(filter: AbstractFilter, z: Array, u: Array, keys: jax.Array) -> jax.Array:
-    """Draw one path of the states for each key (draws, steps, n): one filter pass, then a pass back for each draw."""
-    _, steps = filter_rows_with_smoother_steps(filter, z, u, filter.init(), np.asarray(0))
-    if steps.before is None:
+    """Draw one path of the states for each key (draws, steps, n): one filter pass, then a pass back for each draw.
+
+    Args:
+        filter: the filter.
+        z: measurements (steps, received), NaN where nothing arrived.
+        u: inputs (steps, inputs).
+        keys: a random key for each path (draws,).
+    """
+    first_step = np.asarray(0)
+    _, steps = filter_rows_with_smoother_steps(filter, z, u, filter.init(), first_step)
+    if steps.before is None:  # no single regression of a state on the next, as with several modes
         raise fail("paths", "a filter of one law of motion (rts_smoother takes several)", type(filter).__name__)
     paths: jax.Array = jax.vmap(lambda key: _draw_path_back(steps, key))(keys)
     return paths
@@ -92,7 +101,8 @@ def _draw_path_back(steps: SmootherStep, key: jax.Array) -> jax.Array:
         return x, _take_plant_state(previous, x)
 
     # The last state, then back over pairs of successive steps, each with a key of its own.
-    last, keys = take_step(steps, -1), jax.random.split(key, len(steps.mean))
+    last = take_step(steps, -1)
+    keys = jax.random.split(key, len(steps.mean))
     end = last.manifold.settle(last.after.mean, _draw_gaussian(last.after, keys[-1]))
     pairs = take_steps(steps, slice(None, -1)), take_steps(steps, slice(1, None)), keys[:-1]
     _, earlier = jax.lax.scan(body, end, pairs, reverse=True)
@@ -100,7 +110,7 @@ def _draw_path_back(steps: SmootherStep, key: jax.Array) -> jax.Array:
 
 
 def _draw_gaussian(law: Gaussian, key: jax.Array) -> jax.Array:
-    """Draw m + L diag(d)^1/2 e with e standard normal."""
+    """Draw x = m + L diag(d)^1/2 e, with e standard normal, from a Gaussian of mean m and covariance L diag(d) L'."""
     normal = jax.random.normal(key, law.variances.shape, dtype=float)
     return jnp.asarray(law.mean + law.root @ (square_root(law.variances) * normal))
 

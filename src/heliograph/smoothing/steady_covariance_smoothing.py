@@ -68,6 +68,24 @@ class SmoothedChunk(NamedTuple):
     received: Array
 
 
+class SmoothedMeans(NamedTuple):
+    """Results of one chunk in which covariances are steady, so that only these numbers depend on its data.
+
+    Attributes:
+        end: the filter's means after the chunk's own rows, one array for each Gaussian of its state.
+        after: smoothed mean of the state after the last row, in a list of one array.
+        before: smoothed mean of the state before the first row, in a list of one array.
+        estimates: the leaves of the rows' smoothed estimates that depend on data, (own, ...) each.
+        nis: squared innovation e' S^-1 e of each row (own,).
+    """
+
+    end: list[Any]
+    after: list[Any]
+    before: list[Any]
+    estimates: list[Any]
+    nis: Any
+
+
 class BackwardRecursion(Recursion):
     """Backward pass of the smoothed law over rows, with an estimate of each row.
 
@@ -89,42 +107,42 @@ class BackwardRecursion(Recursion):
 
 
 def smooth_settled_chunks(
-    recursion: SmootherStepRecursion, settled: SettledState, begun: ChunkStarts, windows: PyTree
+    recursion: SmootherStepRecursion, settled: SettledState, chunk_starts: ChunkStarts, windows: PyTree
 ) -> SmoothedChunk | None:
-    """Smooth chunks as if the filter's covariances had settled in all of them; None where that is not possible.
+    """Smooth chunks of complete rows by their means alone, with steady covariances; None where that is not possible.
 
-    A covariance has settled if complete rows change it no more, so that only means must be computed. Chunks are parts
-    of a long recording, which are smoothed side by side. It is not possible if the covariance of the smoothed law does
-    not settle, or without native code.
+    On complete rows the covariances of a filter converge, and so does that of its smoothed law. Where both are steady,
+    only means depend on data. It is not possible if the smoothed covariance does not converge, or without native code.
 
     Args:
-        recursion: the filter over rows.
-        settled: the filter's settled state, and its smoother step there.
-        begun: the states with which the chunks begin, the numbers of their first rows, and `lengths.ahead`, the number
-            of rows in which a filter is supposed to forget its start.
+        recursion: the filter over rows, and how many rows are a chunk's own.
+        settled: the filter's state with its steady covariance; its `outputs` are the smoother step of a row there.
+        chunk_starts: the states before the chunks, the numbers of their first rows, and `lengths.ahead`, the number of
+            rows in which a filter is supposed to forget its start.
         windows: the rows of each chunk and those after it, (chunks, rows, ...).
     """
-    # The smoothed law with a settled covariance, found by repeating the settled smoother step.
+    # Repeat the settled smoother step backward, from the filtered law, until the smoothed covariance is steady. A row
+    # of this pass is the leaves of the smoother step that depend on data, and no input.
     back = BackwardRecursion(settled)
-    leaves = zip(jax.tree.leaves(settled.outputs), settled.varies, strict=True)
-    varying = [np.asarray(leaf)[None] for leaf, varies in leaves if varies]
-    smoothed = find_settled_state(back, settled.outputs.after, (varying, np.zeros((1, 0))), begun.lengths.ahead)
+    varying_leaves = [np.asarray(leaf)[None] for leaf in settled.select_varying(settled.outputs)]
+    rows_back = varying_leaves, np.zeros((1, 0))
+    smoothed = find_settled_state(back, settled.outputs.after, rows_back, chunk_starts.lengths.ahead)
     if smoothed is None:
         return None
-    # Filter and smooth the means of all chunks in one call of compiled code, and put the settled covariances to them.
-    arguments = recursion, back, smoothed, means_of(begun.states), windows, begun.first
+    # Smooth the means of all chunks in one call of native code, then put the steady covariances to them.
+    arguments = recursion, back, smoothed, means_of(chunk_starts.states), windows, chunk_starts.first
     differs_by_chunk = [False, False, False, True, True, True]  # means, rows and numbers of first rows
     choice = choose_code(_smooth_settled, arguments, differs_by_run=differs_by_chunk)
     if choice.code is None:
         return None
-    end, means_after, means_before, estimates, nis = choice.results()
+    means: SmoothedMeans = choice.results()  # each array with a leading axis over the chunks
     return SmoothedChunk(
-        end=settled.repeat_with_means(end),
-        law_after=smoothed.repeat_with_means(means_after),
-        law_before=smoothed.repeat_with_means(means_before),
-        estimate=smoothed.fill_rows(estimates),
-        nis=nis,
-        received=np.full(nis.shape, settled.outputs.received),
+        end=settled.repeat_with_means(means.end),
+        law_after=smoothed.repeat_with_means(means.after),
+        law_before=smoothed.repeat_with_means(means.before),
+        estimate=smoothed.fill_rows(means.estimates),
+        nis=means.nis,
+        received=np.full(means.nis.shape, settled.outputs.received),
     )
 
 
@@ -135,7 +153,7 @@ def _smooth_settled(
     means: Sequence[Array],
     rows: PyTree,
     first: Array,
-) -> tuple[PyTree, ...]:
+) -> SmoothedMeans:
     """Smooth one chunk in which covariances have settled: filter its means ahead, then pass them back.
 
     Covariances have settled where they are the same in each row, so only means are computed. The smoothed mean at the
@@ -148,20 +166,24 @@ def _smooth_settled(
         means: the filter's means before the first row, one array for each Gaussian of its state.
         rows: measurements and inputs (rows, ...) of the chunk and of some rows after it.
         first: number of the chunk's first row.
-
-    Returns:
-        The filter's means after the chunk's own rows, the smoothed means of the states after and before these rows, the
-        leaves of its estimates that depend on data (own, ...), and the squared innovations (own,).
     """
-    own, settled, end = recursion.own, back.settled, first + len(rows[0])
+    own = recursion.own
+    settled = back.settled
+    end = first + len(rows[0])
     # Steps are the leaves of smoother steps that depend on data, of the own rows and of those after them.
     means_at_end, steps = scan_settled_rows(recursion, settled, means, take(rows, slice(own)), first, end)
     rows_after = take(rows, slice(own, None))
     last_means, steps_after = scan_settled_rows(recursion, settled, means_at_end, rows_after, first + own, end)
 
     def pass_back(means: list[jax.Array], varying: list[jax.Array]) -> tuple[list[jax.Array], list[jax.Array]]:
-        """Return the smoothed means before a row from those after it, and the estimate's leaves that depend on data."""
-        law, estimate = step_settled(back, smoothed.state, means, (varying, jnp.zeros(0)), jnp.zeros((), int))
+        """Return the smoothed means before a row from those after it, and the estimate's leaves that depend on data.
+
+        `back` is the backward pass with steady covariances, and `varying` the leaves of the row's smoother step that
+        depend on data.
+        """
+        row = (varying, jnp.zeros(0))
+        row_number = jnp.zeros((), int)  # no inputs; a backward step ignores its number
+        law, estimate = step_settled(back, smoothed.state, means, row, row_number)
         return means_of(law), smoothed.select_varying(estimate)
 
     # Back over the rows after the chunk, which yields the smoothed mean at its end, and then over its own.
@@ -169,4 +191,4 @@ def _smooth_settled(
     smoothed_after, _ = jax.lax.scan(pass_back, filtered_mean, steps_after, reverse=True)
     smoothed_before, estimates = jax.lax.scan(pass_back, smoothed_after, steps, reverse=True)
     nis = settled.fill_row(steps).nis
-    return means_at_end, smoothed_after, smoothed_before, estimates, jnp.broadcast_to(nis, (own,))
+    return SmoothedMeans(means_at_end, smoothed_after, smoothed_before, estimates, nis=jnp.broadcast_to(nis, (own,)))

@@ -3,11 +3,11 @@
 from .climbs import ClimbEnds as ClimbEnds
 from .data import LikelihoodData as LikelihoodData
 from .data import gather_data as gather_data
-from .multistart import AWAY as AWAY
-from .multistart import FURTHER as FURTHER
 from .multistart import HighestPoint as HighestPoint
 from .multistart import MaximumSearch as MaximumSearch
-from .multistart import SPREAD as SPREAD
+from .multistart import SPREAD_OF_LOGARITHMS as SPREAD_OF_LOGARITHMS
+from .multistart import SPREAD_OF_REALS as SPREAD_OF_REALS
+from .multistart import WAY_TO_END as WAY_TO_END
 from .objective import Form as Form
 from .objective import Objective as Objective
 from .objective import join_all_nodes as join_all_nodes
@@ -20,6 +20,7 @@ from .parameter_transforms import slope_from_unconstrained as slope_from_unconst
 from .parameter_transforms import slope_to_unconstrained as slope_to_unconstrained
 from .parameter_transforms import to_unconstrained as to_unconstrained
 from .predictive_density import ChannelDensities as ChannelDensities
+from .predictive_density import ExpectedSignals as ExpectedSignals
 from .predictive_density import NODES as NODES
 from .predictive_density import Predictive as Predictive
 from .predictive_density import evaluate_predictive as evaluate_predictive

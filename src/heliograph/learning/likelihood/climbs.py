@@ -8,20 +8,27 @@ import numpy as np
 from heliograph.numerics.types import Bool, Float
 
 NOISE = 1e-13  # rounding of a log-likelihood, as a share of its size
-JOINED = 0.1  # standard errors between two climbs to one top, and of either from it
-BENT = 0.5  # of the information between two such climbs, that the likelihood bends by at least
-ALIKE = 0.1  # of the gain between two such climbs, that their slopes may leave unexplained
-NEIGHBOURS = 1.0  # between logarithms or logits of two such climbs, whatever the information says
+JOINING_DISTANCE = 0.1  # standard errors between two climbs to one top, and of either from it
+LEAST_BEND = 0.5  # of the information between two such climbs, that the likelihood bends by at least
+UNEXPLAINED_GAIN = 0.1  # of the gain between two such climbs, that their slopes may leave unexplained
+NEIGHBOUR_DISTANCE = 1.0  # between logarithms or logits of two such climbs, whatever the information says
 
+# Log-likelihood l, its gradient and its Gauss-Newton information (near the Hessian of -l) at a point of each climb; and
+# the function that returns them at such points.
 Evaluated = tuple[Float[np.ndarray, " climbs"], Float[np.ndarray, "climbs p"], Float[np.ndarray, "climbs p p"]]
 Evaluate = Callable[[Float[np.ndarray, "climbs p"]], Evaluated]
 
 
 class OpenEnds(NamedTuple):
-    """Coordinates by which an end of a domain is at infinity.
+    """Which unconstrained coordinates have an end of their number's domain at infinity.
 
     A variance of 0 is at minus infinity of its logarithm, probabilities of 0 and 1 are at both ends of their logit.
-    Shapes: low, high, single (p,); single: numbers whose end can be tried alone.
+
+    Args:
+        low: coordinates with an end at minus infinity (p,).
+        high: coordinates with an end at infinity (p,).
+        single: coordinates of a number of their own on an interval, whose end can be tried alone (p,); not those of a
+            covariance or of probabilities that sum to 1.
     """
 
     low: Bool[np.ndarray, " p"]
@@ -41,10 +48,15 @@ class OpenEnds(NamedTuple):
 
 
 class ClimbEnds(NamedTuple):
-    """Ends of the searches, one a climb.
+    """Where some climbs (searches side by side) end.
 
-    x: the points. total: log-likelihood there; gradient: its derivatives. remaining: what a full step would still gain.
-    steps: number of steps that were taken. Shapes: x, gradient (climbs, p), total, converged, remaining (climbs,).
+    Args:
+        x: point of each climb (climbs, p).
+        total: log-likelihood there (climbs,).
+        gradient: its derivatives (climbs, p).
+        converged: whether the climb came to a maximum (climbs,).
+        remaining: what a full step would still gain, in nats (climbs,).
+        steps: number of steps that were taken.
     """
 
     x: Float[np.ndarray, "climbs p"]
@@ -56,16 +68,24 @@ class ClimbEnds(NamedTuple):
 
     @property
     def order(self) -> np.ndarray:
-        """Climbs from the highest likelihood to the lowest."""
+        """Numbers of the climbs from the highest log-likelihood to the lowest; NaN is last."""
         return np.argsort(-np.nan_to_num(self.total, nan=-np.inf), kind="stable")
 
 
 class Climbs(NamedTuple):
     """Climbs (searches side by side) between two steps.
 
-    x: points (climbs, p). total: log-likelihood l there (climbs,), gradient (climbs, p), information I (climbs, p, p).
-    model: B, a model of minus the Hessian of l (climbs, p, p). radius: of the trust region (climbs,). remaining: what a
-    full step would gain, g' I^-1 g / 2. done: climbs that go no further. joined: the climb that each joined, or itself.
+    Args:
+        x: point of each climb (climbs, p).
+        total: log-likelihood l there (climbs,).
+        gradient: g, its derivatives (climbs, p).
+        information: I, the Gauss-Newton information (climbs, p, p).
+        model: B, a model of minus the Hessian of l (climbs, p, p).
+        radius: of the trust region, in standard errors (climbs,).
+        remaining: what a full step would gain, g' I^-1 g / 2, in nats (climbs,).
+        done: climbs that go no further (climbs,).
+        converged: climbs that came to a maximum (climbs,).
+        joined: number of the climb to the same top that each climb joined, its own number if none (climbs,).
     """
 
     x: np.ndarray
@@ -80,23 +100,31 @@ class Climbs(NamedTuple):
     joined: np.ndarray
 
     def ends(self, steps: int) -> ClimbEnds:
-        """Return where the climbs (searches side by side) are after `steps` steps; `joined`: the climb each joined."""
+        """Return where the climbs are after `steps` steps; one that joined another is where that one is."""
         climb = self.joined
         for _ in range(len(climb)):  # a climb may join one that joins a third
             climb = climb[climb]
-        x, total, gradient = self.x[climb], self.total[climb], self.gradient[climb]
+        x = self.x[climb]
+        total = self.total[climb]
+        gradient = self.gradient[climb]
         return ClimbEnds(x, total, gradient, self.converged[climb], self.remaining[climb], steps)
 
 
 def join_climbs(state: Climbs, moving: np.ndarray, domains: OpenEnds) -> Climbs:
     """Return the state in which each climb a is ended that goes to the same top as a higher climb b.
 
-    Two climbs to one top cost twice as much. Both are within JOINED standard errors of a top and of each other, by the
-    information I of either, and less than NEIGHBOURS apart in every logarithm and logit. Between them, along d = x_b -
-    x_a, the log-likelihood l is concave: l_b - l_a is (g_a + g_b)' d / 2 as of a quadratic with gradients g, and
-    (g_a - g_b)' d >= BENT d' I d. `moving`: coordinates that move (climbs, p). `domains`: which are plain real numbers.
+    Two climbs to one top cost twice as much. Both are within JOINING_DISTANCE standard errors of a top and of each
+    other, by the information I of either, and less than NEIGHBOUR_DISTANCE apart in every logarithm and logit. Between
+    them, along d = x_b - x_a, the log-likelihood l is concave: l_b - l_a is (g_a + g_b)' d / 2 as of a quadratic with
+    gradients g, and (g_a - g_b)' d >= LEAST_BEND d' I d.
+
+    Args:
+        state: the climbs, with points x, log-likelihoods l, gradients g and information I.
+        moving: coordinates that move (climbs, p).
+        domains: which coordinates are logarithms or logits, and which plain real numbers.
     """
-    climbs, g = np.arange(len(state.x)), np.nan_to_num(state.gradient)
+    climbs = np.arange(len(state.x))
+    g = np.nan_to_num(state.gradient)
     d = state.x[None, :] - state.x[:, None]  # [a, b]: from climb a to climb b, (a, b, p)
     # d' I d: the greater of the two values by the information of a and of b; `squared` [c, a, b] uses I of climb c.
     squared = np.einsum("abi,cij,abj->cab", d, np.nan_to_num(state.information), d)
@@ -105,12 +133,12 @@ def join_climbs(state: Climbs, moving: np.ndarray, domains: OpenEnds) -> Climbs:
     gain = state.total[None] - state.total[:, None]
     gain_of_quadratic = np.einsum("abi,abi->ab", d, g[:, None] + g[None]) / 2
     slope_fall = np.einsum("abi,abi->ab", d, g[:, None] - g[None])
-    near_top = (2 * state.remaining < JOINED**2) & (state.joined == climbs)  # 2 * remaining: distance squared
-    neighbours = np.all(domains.free | (np.abs(d) < NEIGHBOURS), axis=2)
+    near_top = (2 * state.remaining < JOINING_DISTANCE**2) & (state.joined == climbs)  # 2 * remaining: distance squared
+    neighbours = np.all(domains.free | (np.abs(d) < NEIGHBOUR_DISTANCE), axis=2)
     neighbours &= np.all(moving[:, None] == moving[None], axis=2)
-    is_quadratic = np.abs(gain - gain_of_quadratic) <= ALIKE * gain + NOISE * np.abs(state.total)
-    no_saddle = is_quadratic & (slope_fall >= BENT * distance)
-    same_top = near_top[:, None] & near_top[None] & neighbours & (distance < JOINED**2) & no_saddle
+    is_quadratic = np.abs(gain - gain_of_quadratic) <= UNEXPLAINED_GAIN * gain + NOISE * np.abs(state.total)
+    no_saddle = is_quadratic & (slope_fall >= LEAST_BEND * distance)
+    same_top = near_top[:, None] & near_top[None] & neighbours & (distance < JOINING_DISTANCE**2) & no_saddle
     # [a, b] is true where b goes on: the higher one, of two that are as high the first.
     is_higher = same_top & ((gain > 0) | ((gain == 0) & (climbs[None] < climbs[:, None])))
     joins = ~state.done & np.any(is_higher, axis=1)

@@ -17,10 +17,14 @@ FEWEST = 10  # least count of numbers that arrived for each free number
 
 
 class LikelihoodData(NamedTuple):
-    """Recordings of one network, joined over its nodes and filled up with rows in which nothing arrived.
+    """Recordings of one network, joined over its nodes and filled up to one length, so that arrays hold them all.
 
-    Shapes: measurements (recordings, steps, received), inputs (recordings, steps, inputs), lengths (recordings,);
-    truth (recordings, steps, n), the true states where these are learned from, NaN where they are not known.
+    Args:
+        measurements: numbers that the nodes received, side by side (recordings, steps, received); NaN where one did not
+            arrive, and in the rows that fill up.
+        inputs: inputs of the plant (recordings, steps, inputs); rows that fill up repeat the last ones.
+        lengths: number of rows of each recording without those that fill up.
+        truth: true states where these are learned from, NaN where they are not known (recordings, steps, n); else None.
     """
 
     measurements: Float[np.ndarray, "recordings steps received"]
@@ -78,6 +82,10 @@ def _are_rows(network: Network, entries: object) -> bool:
     """Return whether the entries of a list are the rows of one recording, rather than recordings.
 
     They are rows if each is a number, or has as many numbers as the only node receives, as in `array.tolist()`.
+
+    Args:
+        network: the network, whose only node says how many numbers a row has.
+        entries: the list.
     """
     try:
         values = np.asarray(entries)
@@ -89,7 +97,13 @@ def _are_rows(network: Network, entries: object) -> bool:
 
 
 def _pick_inputs(inputs: object, index: int, several: Sequence[object]) -> object:
-    """Return the inputs of recording number `index`: its entry if `inputs` is a list, else those of all recordings."""
+    """Return the inputs of recording number `index`: its entry if `inputs` is a list, else those of all recordings.
+
+    Args:
+        inputs: inputs for all recordings, or a list with those of each.
+        index: number of the recording.
+        several: all recordings.
+    """
     if not isinstance(inputs, list | tuple):
         return inputs
     if len(inputs) != len(several):
@@ -100,7 +114,11 @@ def _pick_inputs(inputs: object, index: int, several: Sequence[object]) -> objec
 def _split_truth(network: Network, several: Sequence[object], truth: Any, steps: list[int]) -> list[np.ndarray]:
     """Return the true states (steps, n) of each run of each recording, NaN where they are not known.
 
-    `truth`: True for those in the recordings, else the states, or a list of them. `steps`: length of each run.
+    Args:
+        network: the network, for its states.
+        several: the recordings.
+        truth: True for the states in the recordings, else the states, or a list of them.
+        steps: length of each run.
 
     Raises:
         ValueError: recordings without them, other shapes.
@@ -110,6 +128,7 @@ def _split_truth(network: Network, several: Sequence[object], truth: Any, steps:
     if len(listed) != len(several) or any(single is None for single in listed):
         got = "none" if truth is True else f"{len(listed)} of them"
         raise fail("truth", f"the true states of each of the {len(several)} recordings", got)
+    # States of a recording are (steps, n), or of several runs (runs, steps, n).
     runs = [
         run
         for of_recording in (np.asarray(fill_masked(single)) for single in listed)
@@ -172,7 +191,8 @@ def _join_nodes(network: Network, run: list[np.ndarray], inputs: Any) -> tuple[n
         length = len(measured[network.names[0]]) if measured else None  # that of the first node
         rows = check_rows(f"measurements of {name!r}", z, length, network.nodes[name].received, missing=True)
         measured[name] = np.asarray(rows)
-    steps, count = len(measured[network.names[0]]), len(network.inputs)
+    steps = len(measured[network.names[0]])
+    count = len(network.inputs)
     if inputs is None and count:
         raise fail("inputs", f"an array ({steps}, {count}) of {list(network.inputs)}", "none")
     u = np.zeros((steps, 0))
@@ -192,7 +212,13 @@ def _list_runs(values: list[np.ndarray]) -> list[list[np.ndarray]]:
 
 
 def _pad_rows(values: np.ndarray, length: int, filler: float | None) -> np.ndarray:
-    """Return the array (rows, columns) padded to a length, with rows of `filler` or, if it is None, of the last row."""
+    """Return the array (rows, columns) padded to a length, with rows of `filler` or, if it is None, of the last row.
+
+    Args:
+        values: rows of one run (rows, columns).
+        length: number of rows that the result has.
+        filler: value of the added rows, or None.
+    """
     missing = length - len(values)
     added_row = values[-1:] if filler is None else np.full((1, values.shape[1]), filler)
     return np.concatenate([values, np.repeat(added_row, missing, axis=0)]) if missing else values
@@ -215,5 +241,5 @@ def _check_enough_data(data: LikelihoodData, free: int) -> None:
     arrived = [values for values in arrived if len(values)]
     is_constant = bool(arrived) and all(np.ptp(values) == 0 for values in arrived)
     if is_constant:
-        value = array("m", arrived[0], (None,))[0]
+        value = arrived[0][0]
         raise fail("recording", "measurements that vary", f"{value:g} throughout")

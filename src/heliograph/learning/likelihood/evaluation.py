@@ -17,11 +17,16 @@ from heliograph.numerics.types import Array, Float
 
 
 class Evaluation(NamedTuple):
-    """Log-likelihoods and scores of blocks of rows at unconstrained points, and the Gauss-Newton information of halves.
+    """Log-likelihood l of recordings at some points, with its derivatives by the p free numbers.
 
-    A block is a row, or all rows of a long recording.
+    A point is a vector of the free numbers as unconstrained coordinates (p,). Values are given by block: a block is a
+    row, or all rows together of a long recording.
 
-    Shapes: density (points, recordings, blocks), score (points, recordings, blocks, p), halves (points, 2, p, p).
+    Args:
+        density: log density of each block (points, recordings, blocks); their sum is l.
+        score: gradient of each block's log density (points, recordings, blocks, p).
+        halves: Gauss-Newton information, which approximates the Hessian of -l, of the first and the second half of the
+            rows, summed over recordings (points, 2, p, p).
     """
 
     density: Float[Array, "points recordings blocks"]
@@ -30,7 +35,7 @@ class Evaluation(NamedTuple):
 
     @property
     def information(self) -> Float[np.ndarray, "points p p"]:
-        """Gauss-Newton information of all data."""
+        """Gauss-Newton information of all data at each point (points, p, p)."""
         return np.asarray(self.halves.sum(axis=1))
 
     @property
@@ -66,30 +71,38 @@ def evaluate_at_points(
     """
     with jax.enable_x64(True):
         # By chunks; None at points where that cannot be done.
-        evaluations = [_evaluate_in_chunks(objective, point, data, by_row) for point in x]
-        remaining = [i for i, evaluation in enumerate(evaluations) if evaluation is None]
+        by_point = [_evaluate_in_chunks(objective, point, data, by_row) for point in x]
+        remaining = [i for i, evaluation in enumerate(by_point) if evaluation is None]
         if len(remaining) == len(x):
             return _evaluate_side_by_side(objective, x, data)
         # The remaining points row by row, summed as the others are.
         if remaining:
-            whole = _evaluate_side_by_side(objective, x[remaining], data)
-            whole = whole if by_row else _sum_rows(whole)
+            of_remaining = _evaluate_side_by_side(objective, x[remaining], data)
+            of_remaining = of_remaining if by_row else _sum_rows(of_remaining)
             for n, i in enumerate(remaining):
-                evaluations[i] = Evaluation(*(leaf[n : n + 1] for leaf in whole))
+                by_point[i] = Evaluation(*(leaf[n : n + 1] for leaf in of_remaining))
     # Join the points again, field by field.
-    by_field = zip(*(evaluation for evaluation in evaluations if evaluation), strict=True)
+    by_field = zip(*(evaluation for evaluation in by_point if evaluation), strict=True)
     return Evaluation(*(np.concatenate(leaves) for leaves in by_field))
 
 
 def _evaluate_in_chunks(objective: Objective, x: np.ndarray, data: LikelihoodData, by_row: bool) -> Evaluation | None:
     """Return the evaluation at one point x (p,), each recording in chunks side by side; None where that cannot be done.
 
-    It cannot where recordings are short, true states are learned from, or the filter forgets too late.
+    A chunk is a part of a long recording that is filtered apart, which is possible if the filter forgets its start. It
+    is not done where recordings are short, true states are learned from, or the filter forgets too late.
+
+    Args:
+        objective: makes the filter from the free numbers.
+        x: the free numbers as unconstrained coordinates (p,).
+        data: the recordings.
+        by_row: whether densities and scores of each row are needed; else they are sums over all rows, one block.
     """
     linear = _find_linear_filter(objective) if data.truth is None else None
     if linear is None:
         return None
-    recursion = linear.score_rows(objective.filter, x, np.asarray(data.measurements.shape[1] // 2))
+    half = np.asarray(data.measurements.shape[1] // 2)  # number of the first row of the second half
+    recursion = linear.score_rows(objective.filter, x, half)
     by_recording = []
     for z, u in zip(data.measurements, data.inputs, strict=True):
         evaluated = recursion.scan_long(z, u) if by_row else recursion.sum_long(z, u)
@@ -103,8 +116,12 @@ def _evaluate_in_chunks(objective: Objective, x: np.ndarray, data: LikelihoodDat
 
 
 def _sum_rows(rows: Evaluation) -> Evaluation:
-    """Return the evaluation with densities and scores summed over all rows, which then count as one row."""
-    density, score = (leaf.sum(axis=2, keepdims=True) for leaf in (rows.density, rows.score))
+    """Return an evaluation by row with log densities and their gradients summed over all rows, as one block.
+
+    The information (`halves`) is a sum over rows already.
+    """
+    density = rows.density.sum(axis=2, keepdims=True)  # (points, recordings, rows) -> (points, recordings, 1)
+    score = rows.score.sum(axis=2, keepdims=True)  # (points, recordings, rows, p) -> (points, recordings, 1, p)
     return Evaluation(density, score, rows.halves)
 
 
@@ -112,7 +129,11 @@ def _evaluate_side_by_side(objective: Objective, x: np.ndarray, data: Likelihood
     """Return the evaluation of all recordings, row by row, at all points x (points, p), each pair side by side.
 
     Our own compiled code computes it if `choose_code` finds some for these arguments, else XLA, pair by pair.
-    `halves`: the information in the first and in the second half of the rows, summed over recordings.
+
+    Args:
+        objective: makes the filter from the free numbers.
+        x: the points (points, p).
+        data: the recordings.
     """
     data_rows = [rows for rows in (data.measurements, data.inputs, data.truth) if rows is not None]
     # Pair each point with each recording, point after point.
@@ -165,7 +186,7 @@ def evaluate_recording(objective: Objective, x: Array, z: Array, u: Array, truth
         k, e, s, de, ds, compared = row
         # A measurement may end in the modes of a channel, which are not predicted, so e may be shorter.
         compared = compared[: len(e)]
-        size = jnp.abs(compared) + jnp.abs(compared - e)
+        size = jnp.abs(compared) + jnp.abs(compared - e)  # of what e is the difference of, which bounds its rounding
         density, score, information = differentiate_log_density(e, s, (de, ds), size, ~jnp.isnan(e))
         is_in_half = jnp.stack([k < half, k >= half])
         return halves + jnp.where(is_in_half[:, None, None], information, 0.0), (density, score)
@@ -180,7 +201,15 @@ def _differentiate_errors(
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
     """Return e (steps, m), its covariance S (steps, m, m), and their derivatives in the p numbers x.
 
-    e: innovations, or with `truth` errors of the estimates. de (steps, p, m), dS (steps, p, m, m), by forward mode.
+    e are the innovations, or with `truth` the errors of the estimates. The derivatives de (steps, p, m) and dS (steps,
+    p, m, m) are by forward mode.
+
+    Args:
+        objective: makes the filter from the free numbers.
+        x: the free numbers as unconstrained coordinates (p,).
+        z: measurements (steps, received).
+        u: inputs (steps, inputs).
+        truth: true states (steps, n), or None.
     """
 
     def errors_at(x: Array) -> tuple[jax.Array, jax.Array]:
@@ -203,7 +232,8 @@ def _find_linear_filter(objective: Objective) -> Any:
     The linear form filters by means and covariances of gains. Its network is the description's start, or one near it
     if a gain that is random near the start is not at the start itself.
     """
-    description, is_linear = objective.description, objective.form == "linear"
+    description = objective.description
+    is_linear = objective.form == "linear"
     network = choose_typical_network(description) if is_linear else description.start
     filter = make_filter_of_form(network, objective.form)
     return filter if filter.has_score_recursion else None

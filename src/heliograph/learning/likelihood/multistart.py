@@ -12,21 +12,21 @@ import numpy as np
 
 from heliograph.learning.likelihood.climbs import ClimbEnds
 from heliograph.learning.likelihood.surface import LikelihoodSurface
-from heliograph.learning.likelihood.trust_region import MOST_STEPS, NEAR, maximise_from_starts
+from heliograph.learning.likelihood.trust_region import CONVERGED_GAIN_BY_ROUNDING, MOST_STEPS, maximise_from_starts
 from heliograph.numerics.types import Bool, Float
 
 HARDLY_SEEN = 0.01  # information of a logarithm or a logit below which its number may as well be the end of its domain
-SAME = 1e-6  # nats by which a likelihood at the end of a domain may be lower, and count as the same
-SPREAD = 3.0  # of starts, in each coordinate that is a logarithm or a logit
-AWAY = 10.0  # standard errors of starts from a maximum, in each real number
-LOWERED = 10.0  # steps of a logarithm to a start near the end of its domain
-FURTHER = 5.0  # from where a number is hardly seen to where it counts as at the end
+SAME_LIKELIHOOD = 1e-6  # nats by which a likelihood at the end of a domain may be lower, and count as the same
+SPREAD_OF_LOGARITHMS = 3.0  # of starts, in each coordinate that is a logarithm or a logit
+SPREAD_OF_REALS = 10.0  # standard errors of starts from a maximum, in each real number
+WAY_TOWARDS_LOW_END = 10.0  # steps of a logarithm to a start near the end of its domain
+WAY_TO_END = 5.0  # from where a number is hardly seen to where it counts as at the end
 ROUNDS = 6  # of climbs, ends of domains, and proofs
-INWARDS = np.linspace(0.0, 40.0, 41)  # from the end of a domain
-EXACTLY = 20.0  # logarithm of the size of data over that of their innovations: two in a thousand million
-SEEN = 2.0  # nats by which a likelihood has fallen where a number is seen
-AT_ONE_POINT = 1e-3  # standard errors between starts that the first rows of a recording lead to one point
-SADDLE = -1e-3  # curvature in units of standard errors below which a point is no maximum
+DISTANCES_INWARDS = np.linspace(0.0, 40.0, 41)  # from the end of a domain
+EXACT_FIT = 20.0  # logarithm of the size of data over that of their innovations: two in a thousand million
+VISIBLE_FALL = 2.0  # nats by which a likelihood has fallen where a number is seen
+SAME_POINT = 1e-3  # standard errors between starts that the first rows of a recording lead to one point
+SADDLE_CURVATURE = -1e-3  # curvature in units of standard errors below which a point is no maximum
 
 Watch = Callable[[ClimbEnds], None]
 
@@ -88,18 +88,20 @@ class MaximumSearch:
             starts: where to begin (starts, p); from a single one there is a single climb.
             seed: seed of the second round.
         """
-        no_ends = np.zeros(starts.shape[1])
-        climbed = self._climb_by_first_rows(starts, no_ends, 0)
+        no_ends = np.zeros(starts.shape[1])  # no coordinate is held at an end of its domain
+        climbed = self._climb_by_first_rows(starts, no_ends, own=0)
         top = self._prove_maximum(climbed)
-        self.best, totals = top._replace(converged=False, reason=""), climbed.total  # totals: l at each climb's end
+        self.best = top._replace(converged=False, reason="")
+        totals = climbed.total  # totals: l at each climb's end
         if len(starts) > 1:
             around = self._draw_starts_around(top, len(starts) - 1, seed)
             # The top itself is the last start, so that climbs to it join it; it is no new result, hence [:-1].
-            climbed = self._climb_by_first_rows(np.concatenate([around, top.x[None]]), no_ends, len(around))
+            climbed = self._climb_by_first_rows(np.concatenate([around, top.x[None]]), no_ends, own=len(around))
             totals = np.concatenate([totals, climbed.total[:-1]])
-            if climbed.total.max() > top.total + SAME:
+            if climbed.total.max() > top.total + SAME_LIKELIHOOD:
                 top = self._prove_maximum(climbed)
-        self.best, self.ends = top, -np.sort(-np.nan_to_num(totals, nan=-np.inf))  # the highest first
+        self.best = top
+        self.ends = -np.sort(-np.nan_to_num(totals, nan=-np.inf))  # the highest first
         return top
 
     def _prove_maximum(self, climbed: ClimbEnds) -> HighestPoint:
@@ -107,7 +109,7 @@ class MaximumSearch:
 
         A point is a maximum if two conditions hold. For numbers inside their domains, g' H^-1 g is negligible and H is
         not indefinite, with g the gradient of the log-likelihood l and H the Hessian of -l. For numbers that were put
-        at an end of their domain, l does not rise on the way back inside.
+        at an end of their domain, l does not rise on the way back inside. `climbed`: where the climbs ended.
         """
         no_ends = np.zeros(climbed.x.shape[1])
         top = _take_best_climb(climbed, no_ends)
@@ -124,21 +126,30 @@ class MaximumSearch:
     def _draw_starts_around(self, top: HighestPoint, count: int, seed: int) -> Float[np.ndarray, "points p"]:
         """Return `count` points drawn around a maximum, and one more for each number on an interval, near its low end.
 
-        Logarithms and logits are drawn within SPREAD of the maximum, real numbers within AWAY standard errors. The
-        extra point of a number has its logarithm or logit lowered by LOWERED.
+        Logarithms and logits are drawn within SPREAD_OF_LOGARITHMS of the maximum, real numbers within SPREAD_OF_REALS
+        standard errors. The extra point of a number has its logarithm or logit lowered by WAY_TOWARDS_LOW_END.
+
+        Args:
+            top: the maximum.
+            count: number of points drawn around it.
+            seed: of the random numbers.
         """
         deviation = self.surface.standard_errors(top.x)
-        spread = np.where(self.surface.domains.free, AWAY * np.where(np.isfinite(deviation), deviation, 0.0), SPREAD)
+        spread = np.where(
+            self.surface.domains.free,
+            SPREAD_OF_REALS * np.where(np.isfinite(deviation), deviation, 0.0),
+            SPREAD_OF_LOGARITHMS,
+        )
         with_ends = np.flatnonzero(self.surface.domains.single)
         drawn = np.random.default_rng([seed, 2]).uniform(-1.0, 1.0, (count + len(with_ends), len(top.x)))
-        # A number at an end of its domain is drawn around another centre: of the distances INWARDS from the end, the
-        # last at which l has not fallen by SEEN nats.
+        # A number at an end of its domain is drawn around another centre: of the distances DISTANCES_INWARDS from the
+        # end, the last at which l has not fallen by VISIBLE_FALL nats.
         centre = top.x.copy()
         for index in np.flatnonzero(top.ends):
             _, rise = self._evaluate_inwards_of_end(top, int(index))
-            centre[index] -= top.ends[index] * INWARDS[np.flatnonzero(rise > -SEEN)[-1]]
+            centre[index] -= top.ends[index] * DISTANCES_INWARDS[np.flatnonzero(rise > -VISIBLE_FALL)[-1]]
         points = centre + drawn * spread
-        points[count + np.arange(len(with_ends)), with_ends] -= LOWERED
+        points[count + np.arange(len(with_ends)), with_ends] -= WAY_TOWARDS_LOW_END
         return (self.surface.of_first_rows() or self.surface).move_to_finite_likelihood(points, top.x)
 
     def _climb_by_first_rows(self, starts: np.ndarray, ends: np.ndarray, own: int) -> ClimbEnds:
@@ -159,16 +170,17 @@ class MaximumSearch:
         if short is None:
             return self._climb(starts, ends)
         # Climb from all starts but `own` by the first rows. Coordinates at an end of their domain do not move.
-        others, x = np.arange(len(starts)) != own, starts.copy()
+        others = np.arange(len(starts)) != own
+        x = starts.copy()
         moving = np.repeat((ends == 0)[None], len(starts) - 1, axis=0)
         short_ends = maximise_from_starts(
             short.evaluate, starts[others], moving, domains=self.surface.domains, joining=True
         )
         x[others] = short_ends.x
-        # Each start joins the first one that is at the same point, to AT_ONE_POINT standard errors: `climbing` are the
+        # Each start joins the first one that is at the same point, to SAME_POINT standard errors: `climbing` are the
         # starts that climb, and `climb_of_start` which of these stands for each.
         error = short.standard_errors(short_ends.x[short_ends.order[0]])
-        reach = AT_ONE_POINT * np.where(np.isfinite(error), error, 0.0)
+        reach = SAME_POINT * np.where(np.isfinite(error), error, 0.0)
         are_same = np.all(np.abs(x[:, None] - x[None]) <= reach, axis=2)
         climbing, climb_of_start = np.unique(np.argmax(are_same, axis=1), return_inverse=True)
         # Climb by all rows. A point where the likelihood is not finite is first moved towards the start `own`.
@@ -184,7 +196,10 @@ class MaximumSearch:
         """
 
         def keep_best(now: ClimbEnds) -> None:
-            """Keep the best point so far in `self.best`, as not converged, and call `self.watch` with the climbs."""
+            """Keep the best point so far in `self.best`, as not converged, and call `self.watch` with the climbs.
+
+            `ends` are the coordinates that are held at an end of their domain.
+            """
             top = _take_best_climb(now, ends)
             if self.best is None or not top.total < self.best.total:  # `not <` also if the earlier total is NaN
                 self.best = top._replace(converged=False, reason="")
@@ -198,37 +213,43 @@ class MaximumSearch:
     def _move_to_limits(self, top: HighestPoint) -> HighestPoint:
         """Return the point with those numbers at an end of their domain that the data hardly see, climbed anew.
 
-        A number is put there if the likelihood is the same there as where the climb ended.
+        A number is put there if the likelihood is the same there as where the climb ended. The data hardly see a number
+        whose logarithm or logit has an information below HARDLY_SEEN. `top`: the highest point so far.
         """
-        domains, x, total, ends = self.surface.domains, top.x.copy(), top.total, top.ends.copy()
+        domains = self.surface.domains
+        x = top.x.copy()
+        total = top.total
+        ends = top.ends.copy()
         information = np.diag(self.surface.evaluations(x[None]).information[0])
         for index in np.flatnonzero(top.active & domains.single & (information < HARDLY_SEEN)):
             side = 1.0 if domains.high[index] and x[index] > 0 else -1.0
             moved = x.copy()
-            moved[index] += side * FURTHER
+            moved[index] += side * WAY_TO_END
             there = self.surface.evaluations(moved[None])
             is_finite = np.isfinite(there.gradient).all() and np.isfinite(there.information).all()
-            if is_finite and there.total[0] > total - SAME:
+            if is_finite and there.total[0] > total - SAME_LIKELIHOOD:
                 x, total, ends[index] = moved, float(there.total[0]), side
         if np.array_equal(ends, top.ends):
             return top
         return _take_best_climb(self._climb(x[None], ends), ends)
 
     def _choose_restarts(self, top: HighestPoint) -> tuple[np.ndarray | None, str]:
-        """Return (points, reason): where to climb again if `top` is no maximum, or why it is none if no points help.
+        """Return the points (points, p) from which to climb again if `top` is no maximum, and why it is none.
 
-        A maximum gives (None, ""). SAME: nats that count as no rise. SADDLE: a curvature below it (negative) is that of
-        a saddle. NEAR: a gain of l promised by Newton's step that counts as none.
+        A maximum gives (None, ""). It is none if l rises by more than SAME_LIKELIHOOD on the way inside from an end of
+        a domain, or if the least curvature is below SADDLE_CURVATURE (negative): both give points to climb from. It is
+        also none if Newton's step promises a gain of CONVERGED_GAIN_BY_ROUNDING or more; no points help then, and the
+        reason says so.
         """
         # For each number at an end of its domain: climb again if l rises on the way back inside.
         for index in np.flatnonzero(top.ends):
             points, rise = self._evaluate_inwards_of_end(top, int(index))
-            if rise.max() > SAME:
+            if rise.max() > SAME_LIKELIHOOD:
                 return points[[int(rise.argmax())]], ""
         curvature = self.surface.measure_curvature(top.x, top.active)
-        if curvature.least < SADDLE:
+        if curvature.least < SADDLE_CURVATURE:
             return top.x + np.array([[1.0], [-1.0]]) * curvature.direction, ""  # on both sides of the saddle
-        if not curvature.gain < NEAR:
+        if not curvature.gain < CONVERGED_GAIN_BY_ROUNDING:
             return None, f"a step by the Hessian promises {curvature.gain:.2g} of log-likelihood"
         return None, ""
 
@@ -236,34 +257,42 @@ class MaximumSearch:
         """Return a sentence if the likelihood has no maximum because the network reproduces the data exactly, else "".
 
         l then grows for ever as variances fall, but a climb ends where innovations are rounding. l per number of data
-        is about -log |innovation|, so l + log |data| is about log(|data| / |innovation|): above EXACTLY it is rounding.
+        is about -log |innovation|, so l + log |data| is about log(|data| / |innovation|): above EXACT_FIT it is
+        rounding. `top`: the highest point.
         """
         data = self.surface.data.measurements if self.surface.data.truth is None else self.surface.data.truth
         log_likelihood_of_number = top.total / np.count_nonzero(~np.isnan(data))
         log_size = np.log(np.nanmax(np.abs(data)))
-        if log_likelihood_of_number + log_size > EXACTLY:
+        if log_likelihood_of_number + log_size > EXACT_FIT:
             return "the likelihood grows for ever as variances fall to 0, for the network reproduces the data exactly"
         return ""
 
     def _evaluate_inwards_of_end(self, top: HighestPoint, index: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return points (INWARDS, p) from the end of a number's domain inwards, and how much higher l is there.
+        """Return points (points, p) from the end of a number's domain inwards, and how much higher l is at each.
 
-        `index`: coordinate of the number. `top`: the point at the end. INWARDS: distances from the end, 0 to 40 steps
-        of a logarithm or logit. The log-likelihood l counts as -inf where it is NaN.
+        Their distances from the end are DISTANCES_INWARDS, 0 to 40 steps of a logarithm or logit. The log-likelihood l
+        counts as -inf where it is NaN.
+
+        Args:
+            top: the point, at which the number is at an end of its domain.
+            index: coordinate of the number.
         """
-        points = np.repeat(top.x[None], len(INWARDS), axis=0)
-        points[:, index] -= top.ends[index] * INWARDS
+        points = np.repeat(top.x[None], len(DISTANCES_INWARDS), axis=0)
+        points[:, index] -= top.ends[index] * DISTANCES_INWARDS
         return points, np.nan_to_num(self.surface.evaluations(points).total - top.total, nan=-np.inf)
 
 
 def _take_best_climb(climbed: ClimbEnds, ends: np.ndarray) -> HighestPoint:
     """Return the best of the climbs, with the reason why it stopped if it did not converge.
 
-    `ends` (p,): -1 or 1 if a coordinate was held at an end of its domain, else 0. `climbed.order`: numbers of the
-    climbs from the highest down. `climbed.remaining`: nats that a further step would still gain.
+    Args:
+        climbed: where the climbs ended: `order` has their numbers from the highest down, and `remaining` the nats that
+            a further step would still gain.
+        ends: -1 or 1 if a coordinate was held at an end of its domain, else 0 (p,).
     """
     best = int(climbed.order[0])
-    converged, remaining = bool(climbed.converged[best]), float(climbed.remaining[best])
+    converged = bool(climbed.converged[best])
+    remaining = float(climbed.remaining[best])
     return HighestPoint(
         x=climbed.x[best].copy(),
         ends=ends,

@@ -29,6 +29,8 @@ from heliograph.simulation.node import Node
 def join_all_nodes(network: Network) -> tuple[AnyPlant, AnySensor, Channel]:
     """Return the plant, and the sensor and channel of all nodes together in their order, if all packets arrive.
 
+    A fit takes what all nodes receive as one measurement, since their sensors see one state.
+
     Raises:
         ValueError: relays that filter and forward, sensors with feedback, senders of words (a sensor with a resolution
             can be learned).
@@ -63,10 +65,11 @@ Form = Literal["linear", "conditional", "truth"]
 
 @dataclass(frozen=True, eq=False)
 class Objective:
-    """Filter of one form, as a function of unconstrained numbers. Equal ones share a compiled program.
+    """What a fit maximises: the likelihood of the filter of one form, as a function of the free numbers.
 
-    A function may read numbers that live outside of it; a change of these shows in the network that it returns at the
-    start.
+    Equal objectives share a compiled program. They are compared by the code and closure of the function that builds the
+    network. It may also read numbers that live outside of it; a change of these shows in the network that it returns at
+    the start, which is compared too.
 
     Args:
         description: the network with its free numbers.
@@ -77,13 +80,18 @@ class Objective:
     form: Form
 
     def __eq__(self, other: object) -> bool:
+        """Return whether the other objective has the same likelihood; a program compiled for one then serves both."""
         return isinstance(other, Objective) and are_same(self._list_distinctions(), other._list_distinctions())
 
     def __hash__(self) -> int:
+        """Return the hash of parts in which equal objectives agree: code of the building function, and form."""
         return hash((_list_code_and_closure(self.description.build)[0], self.form))
 
     def _list_distinctions(self) -> tuple[object, ...]:
-        """Return a tuple of everything by which two objectives may differ, to compare them."""
+        """Return a tuple of everything by which two objectives may differ, to compare them.
+
+        The network at the start is among it, as the function may read numbers that live outside of it.
+        """
         description = self.description
         return (
             self.form,
@@ -94,26 +102,26 @@ class Objective:
         )
 
     def filter(self, x: Array) -> AbstractFilter:
-        """Return the filter of this form at unconstrained coordinates x (p,)."""
+        """Return the filter of this form with the free numbers at unconstrained coordinates x (p,)."""
         return make_filter_of_form(self.description.at(self.description.parameters.values(x)), self.form)
 
     def compute_innovations(self, x: Array, z: Array, u: Array) -> tuple[jax.Array, jax.Array]:
-        """Return the innovations (steps, m), NaN where nothing arrived, and their covariances (steps, m, m).
+        """Return the filter's innovations (steps, m), NaN where nothing arrived, and their covariances (steps, m, m).
 
-        Of the filter at x (p,), with measurements z (steps, received) and inputs u (steps, inputs). Where the estimate
-        is no number the innovation is 0 and its covariance NaN, so that the likelihood is NaN there, and not that of a
-        row in which nothing arrived.
+        The filter has the free numbers at x (p,), and runs over measurements z (steps, received) and inputs u
+        (steps, inputs). Where the estimate is no number the innovation is 0 and its covariance NaN, so that the
+        likelihood is NaN there, and not that of a row in which nothing arrived.
         """
         filter = self.filter(x)
 
         def judged(state: PyTree, innovation: Innovation, k: jax.Array) -> tuple[jax.Array, jax.Array]:
             """Return a row's innovation and its covariance, or 0 and NaN if the filter has lost its estimate (NaN).
 
-            The NaN makes the likelihood NaN. An innovation of NaN would count as a row where nothing arrived. `filter`:
-            the filter at the values of the free numbers.
+            The NaN makes the likelihood NaN. An innovation of NaN would count as a row where nothing arrived.
             """
             is_lost = jnp.any(jnp.isnan(jnp.asarray(filter.estimate(state).mean)))
-            value, covariance = jnp.asarray(innovation.value), jnp.asarray(innovation.covariance)
+            value = jnp.asarray(innovation.value)
+            covariance = jnp.asarray(innovation.covariance)
             return jnp.where(is_lost, 0.0, value), jnp.where(is_lost, jnp.nan, covariance)
 
         innovations: tuple[jax.Array, jax.Array] = filter.scan(z, u, judged)
@@ -125,10 +133,14 @@ class Objective:
         Errors are NaN where the truth is not known. z: measurements (steps, received). u: inputs (steps, inputs).
         `truth`: true states (steps, n).
         """
-        filter, angles = self.filter(x), first(self.description.start.plant).angles
+        filter = self.filter(x)
+        angles = first(self.description.start.plant).angles
 
         def read_estimate(state: PyTree, innovation: Innovation, k: jax.Array) -> tuple[jax.Array, jax.Array]:
-            """Return mean and claimed covariance of the estimate after a row."""
+            """Return mean and claimed covariance of the estimate after a row.
+
+            `filter` is the filter with the free numbers at x.
+            """
             estimate = filter.estimate(state)
             return jnp.asarray(estimate.mean), jnp.asarray(estimate.covariance)
 
@@ -165,7 +177,11 @@ def make_objectives(network: Description, by_truth: bool = False) -> list[Object
 
 @lru_cache
 def _reuse_equal_objective(objective: Objective) -> Objective:
-    """Return the first objective that equals this one, so that its compiled program is found without a comparison."""
+    """Return the first objective that equals this one, from the cache; this one itself if it is the first.
+
+    Compiled programs are found by their objective. To compare two objectives that are not the same object takes long,
+    as it builds their networks. `lru_cache` does it here once, and from then on all use one object.
+    """
     return objective
 
 
@@ -186,18 +202,20 @@ def _has_random_gain(network: Network) -> bool:
 
     Channels with a memory, and gains that the receiver knows, do not count: no average over gains is needed there.
     """
-    link = first(join_all_nodes(network)[-1])
+    _, _, channel = join_all_nodes(network)
+    link = first(channel)
     return not (link.remembers or link.past or link.has_known_gain) and has_random_gain(link, second_order(link))
 
 
 def list_forms(description: Description) -> list[Form]:
     """Return the forms of the likelihood that a network allows, "linear" before "conditional".
 
-    The linear form uses the unconditional moments of the state, the conditional form those given the data. `circular`:
-    whether there are angles. `link.past`: by how many steps packets may be late.
+    The linear form uses the unconditional moments of the state, the conditional form those given the data. Models that
+    are not linear, or have angles (`circular`), have only the conditional form; packets may then not be late
+    (`link.past`: by how many steps).
     """
     plant, sensor, channel = join_all_nodes(description.start)
-    link = first(channel)
+    link = first(channel)  # the channel of the first step, if it varies; its kind is the same at all
     if not is_linear(plant, sensor) or first(plant).circular or first(sensor).circular:
         if link.past:
             raise fail("network to be learned", "a linear plant and sensor behind links that are late", "others")

@@ -103,7 +103,10 @@ def from_unconstrained(domain: Domain, value: PyTree) -> PyTree:
 
 
 def slope_from_unconstrained(domain: Domain, value: PyTree) -> PyTree:
-    """Return the derivative of `from_unconstrained` at an unconstrained value."""
+    """Return the derivative of `from_unconstrained` at an unconstrained value.
+
+    By the chain rule it takes an error of the unconstrained value to one of the number.
+    """
     if np.isfinite(domain.low) and np.isfinite(domain.high):
         return (domain.high - domain.low) / (2 * np.cosh(value / 2)) ** 2
     if np.isfinite(domain.low):
@@ -112,7 +115,10 @@ def slope_from_unconstrained(domain: Domain, value: PyTree) -> PyTree:
 
 
 def slope_to_unconstrained(domain: Domain, value: PyTree) -> PyTree:
-    """Return the derivative of `to_unconstrained` at a number of the interval."""
+    """Return the derivative of `to_unconstrained` at a number of the interval.
+
+    By the chain rule it takes an error of the number to one of its logarithm or logit.
+    """
     if np.isfinite(domain.low) and np.isfinite(domain.high):
         return (domain.high - domain.low) / ((value - domain.low) * (domain.high - value))
     if np.isfinite(domain.low):
@@ -121,7 +127,15 @@ def slope_to_unconstrained(domain: Domain, value: PyTree) -> PyTree:
 
 
 def count_coordinates(domain: Domain, shape: tuple[int, ...]) -> int:
-    """Return how many unconstrained coordinates a number of this domain and shape has."""
+    """Return how many unconstrained coordinates a number of this domain and shape has.
+
+    Those that have to fulfil a condition have fewer coordinates than entries: probabilities sum to 1, a covariance is
+    symmetric.
+
+    Args:
+        domain: an interval, probabilities that sum to 1 over the last axis ("simplex"), or a covariance.
+        shape: the number's shape.
+    """
     entries = int(np.prod(shape))
     if domain.kind == "simplex":
         # The probabilities of each distribution (last axis) sum to 1: one of them is not free.

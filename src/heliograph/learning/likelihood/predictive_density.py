@@ -46,7 +46,14 @@ def approximate_law_by_nodes(law: AbstractLaw, count: int) -> Discrete:
 
 
 def discretise_laws(channel: Map, count: int) -> Map:
-    """Return the channel with the law of each random gain replaced by `count` values; constant gains stay."""
+    """Return the channel with the law of each random gain replaced by `count` values; constant gains stay.
+
+    What arrives then is a mixture of finitely many Gaussians, whose density can be computed.
+
+    Args:
+        channel: the channel, a tree with laws of gains among its leaves.
+        count: number of values of each law.
+    """
 
     def is_law(leaf: object) -> bool:
         """Return whether a part of the channel is a law, which is replaced as a whole."""
@@ -106,6 +113,14 @@ class Predictive(NamedTuple):
 def make_signal_filter(plant: AnyPlant, sensor: AnySensor, channel: AbstractRandomAffine) -> Any:
     """Return the filter that predicts what the sensor sends (`expect_signals`).
 
+    It is the filter of the conditional form of a fit: it knows mean and covariance of gains, and its prior is
+    Gaussian.
+
+    Args:
+        plant: the plant.
+        sensor: the sensor.
+        channel: the channel, given that something arrives.
+
     Raises:
         ValueError: a plant or sensor with modes, or an unknown start.
     """
@@ -156,15 +171,34 @@ def predictive(
     given_inputs = np.zeros((len(z), 0)) if inputs is None else inputs
     u = check_rows("inputs", given_inputs, len(z), len(filter.inputs), missing=False)
     # Mean and covariance of the sensor's signal before each step, and z with angles in the turn next to their mean.
-    y, covariance, measured = filter.expect_signals(z, u)
-    expected = np.asarray(y), np.asarray(covariance), np.asarray(measured)
+    expected = ExpectedSignals(*map(np.asarray, filter.expect_signals(z, u)))
     return evaluate_predictive(expected, ChannelDensities.of(received, nodes))
 
 
-class StackPartDensity(NamedTuple):
-    """Part of a stack as arrays over the combinations of its gains and noises: z = gain y + offset + noise in each.
+class ExpectedSignals(NamedTuple):
+    """What a filter expects of the sensor's signal y before each step, and what was measured.
 
-    Shapes: log_weight (a,), gain (a, m, p), offset (a, m), noise (a, m, m).
+    Args:
+        mean: mean of y, given the earlier steps (steps, p).
+        covariance: its covariance P_y (steps, p, p).
+        z: measurements (steps, m), NaN where a component did not arrive; angles in the turn next to their mean.
+    """
+
+    mean: np.ndarray
+    covariance: np.ndarray
+    z: np.ndarray
+
+
+class StackPartDensity(NamedTuple):
+    """Law of one part of a channel, a mixture: in each combination of values of its gains, z = G y + offset + noise.
+
+    y (p,) is the sensor's signal and z (m,) what arrives of this part.
+
+    Args:
+        log_weight: log of the probability of each combination a (a,).
+        gain: G (a, m, p).
+        offset: (a, m).
+        noise: covariance of the noise (a, m, m).
     """
 
     log_weight: np.ndarray
@@ -202,24 +236,24 @@ def _stack_combinations(components: list[AffineComponent]) -> StackPartDensity:
     )
 
 
-def evaluate_predictive(expected: tuple[np.ndarray, np.ndarray, np.ndarray], parts: ChannelDensities) -> Predictive:
-    """Return densities and probability integral transforms of measurements.
+def evaluate_predictive(expected: ExpectedSignals, parts: ChannelDensities) -> Predictive:
+    """Return the density and the probability integral transform of each measurement, given the steps before.
 
     Args:
-        expected: mean (steps, p) and covariance (steps, p, p) of the signal before each step, and z (steps, m).
-        parts: the combinations of gains of each part of the channel.
+        expected: what is expected of the signal before each step, and what was measured.
+        parts: law of each part of the channel, a mixture over the values of its gains.
     """
-    y, spread, z = expected
+    y, P_y, z = expected
     # Score ROWS steps at a time, so that memory stays bounded. Without steps there is one empty block.
     blocks = [
-        _score_stack_parts(y[i : i + ROWS], spread[i : i + ROWS], z[i : i + ROWS], parts)
+        _score_stack_parts(y[i : i + ROWS], P_y[i : i + ROWS], z[i : i + ROWS], parts)
         for i in range(0, max(len(z), 1), ROWS)
     ]
     return Predictive(*(np.concatenate(column) for column in zip(*blocks, strict=True)))
 
 
 def _score_stack_parts(
-    y: np.ndarray, spread: np.ndarray, z: np.ndarray, parts: ChannelDensities
+    y: np.ndarray, P_y: np.ndarray, z: np.ndarray, parts: ChannelDensities
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return log-densities (steps,) and transforms (steps, m) of all parts of a stack, each given those before it.
 
@@ -229,7 +263,7 @@ def _score_stack_parts(
 
     Args:
         y: mean (steps, p) of the sensor's signal before each step.
-        spread: its covariance (steps, p, p).
+        P_y: its covariance (steps, p, p).
         z: measurements (steps, m), NaN where a component did not arrive.
         parts: gains (a, outputs, p), offsets, noises and probabilities of each part's combinations.
     """
@@ -237,7 +271,7 @@ def _score_stack_parts(
     for i, law in enumerate(parts):
         stop = start + law.gain.shape[1]
         # log_weight[..., j] = log(P(a) p(components before j | a)); error: standardised, given a and those before.
-        log_weight, error = _weigh_combinations(y, spread, z[:, start:stop], law)
+        log_weight, error = _weigh_combinations(y, P_y, z[:, start:stop], law)
         # The transform is sum_a P(a | components before) Phi(error of it in combination a of gains).
         for j in range(stop - start):
             weight = np.exp(log_weight[..., j] - logsumexp(log_weight[..., j], axis=1, keepdims=True))
@@ -249,13 +283,13 @@ def _score_stack_parts(
         if i + 1 < len(parts):
             log_posterior = log_weight[..., -1] - of_part[:, None]
             posterior = np.exp(log_posterior)
-            y, spread = _correct_signal(y, spread, z[:, start:stop], law, posterior)
+            y, P_y = _correct_signal(y, P_y, z[:, start:stop], law, posterior)
         start = stop
     return log_density, np.stack(transforms, axis=1)
 
 
 def _weigh_combinations(
-    y: np.ndarray, spread: np.ndarray, z: np.ndarray, law: StackPartDensity
+    y: np.ndarray, P_y: np.ndarray, z: np.ndarray, law: StackPartDensity
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return log-weights of combinations of gains, and the errors L^-1 (z - E z), standard normal given those before.
 
@@ -266,14 +300,14 @@ def _weigh_combinations(
 
     Args:
         y: mean of the signal (t, p).
-        spread: P_y, its covariance (t, p, p).
+        P_y: its covariance (t, p, p).
         z: measured components of this part (t, m), NaN where none arrived.
         law: gain G, offset and noise N of each combination.
     """
     # G P_y G' + N (t, a, m, m), and 1 on the diagonal for components that did not arrive; L is its Cholesky factor.
     present = ~np.isnan(z)[:, None]
     both = present[..., None] & present[..., None, :]
-    total = np.einsum("amp,tpq,anq->tamn", law.gain, spread, law.gain) + law.noise
+    total = np.einsum("amp,tpq,anq->tamn", law.gain, P_y, law.gain) + law.noise
     total = np.where(both, total, np.where(np.eye(z.shape[1], dtype=bool), 1.0, 0.0))
     try:
         root = np.linalg.cholesky(total)
@@ -291,7 +325,7 @@ def _weigh_combinations(
 
 
 def _correct_signal(
-    y: np.ndarray, spread: np.ndarray, z: np.ndarray, law: StackPartDensity, weight: np.ndarray
+    y: np.ndarray, P_y: np.ndarray, z: np.ndarray, law: StackPartDensity, weight: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return mean (t, p) and covariance (t, p, p) of the signal given this part's measurements too.
 
@@ -302,7 +336,7 @@ def _correct_signal(
 
     Args:
         y: mean of the signal (t, p).
-        spread: its covariance (t, p, p).
+        P_y: its covariance (t, p, p).
         z: measured components (t, m), NaN where none arrived.
         law: gain, offset and noise of each combination.
         weight: w, the probability of each combination given z (t, a).
@@ -312,7 +346,7 @@ def _correct_signal(
     present = ~np.isnan(z)[:, None, :, None]
     value = np.where(present[..., 0], z[:, None] - np.einsum("amp,tp->tam", law.gain, y) - law.offset, 0.0)
     gain, noise = (np.where(present, rows, 0.0) for rows in (law.gain, roots_of(law.noise)))
-    updated = observe_root(roots_of(spread)[:, None], gain, noise)
+    updated = observe_root(roots_of(P_y)[:, None], gain, noise)
     # m_a - y = gain (innovation) of each combination, and m - y, their mean.
     moves = np.einsum("tapm,tam->tap", updated.gain, value)
     mean_move = np.einsum("ta,tap->tp", weight, moves)

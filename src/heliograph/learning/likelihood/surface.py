@@ -15,21 +15,27 @@ from heliograph.learning.likelihood.data import LikelihoodData
 from heliograph.learning.likelihood.evaluation import Evaluation, evaluate_at_points
 from heliograph.learning.likelihood.objective import Objective
 from heliograph.learning.likelihood.trust_region import maximise_from_starts
-from heliograph.learning.likelihood.trust_region_step import FLAT
+from heliograph.learning.likelihood.trust_region_step import FLAT_EIGENVALUE
 from heliograph.numerics.types import Bool, Float
 
-DIFFERENCE = 1e-3  # standard errors over which scores are differenced
-CUTS = 40  # of a profile at most
-EXACT = 1e-3  # of the root of a fall
-ENOUGH = 1e-6  # nats that may remain to be gained on a profile
+DIFFERENCE_WIDTH = 1e-3  # standard errors over which scores are differenced
+MOST_CUTS = 40  # of a profile at most
+ACCURACY_OF_FALL = 1e-3  # of the root of a fall
+CLOSE_ON_PROFILE = 1e-6  # nats that may remain to be gained on a profile
 HALVINGS = 8  # of the way to a point at which the likelihood is finite
-FIRST = 1 << 14  # rows of a long recording that say where climbs from drawn starts begin
-LONG = 1 << 17  # rows
+FIRST_ROWS = 1 << 14  # rows of a long recording that say where climbs from drawn starts begin
+LONG_RECORDING = 1 << 17  # rows
 TINY = 1e-300
 
 
 class LeastCurvature(NamedTuple):
-    """Least eigenvalue of the Hessian of -l in standard errors, its direction (p,), and g' |H|^-1 g / 2."""
+    """How the log-likelihood l bends at a point, by the Hessian H of -l in units of standard errors.
+
+    Args:
+        least: least eigenvalue of H; negative at a saddle.
+        direction: its eigenvector in unconstrained coordinates (p,).
+        gain: what a Newton step would gain, g' |H|^-1 g / 2 with the gradient g of l, in nats.
+    """
 
     least: float
     direction: Float[np.ndarray, " p"]
@@ -60,20 +66,26 @@ class LikelihoodSurface:
         return OpenEnds(low=low, high=high, single=single & (low | high))
 
     def of_first_rows(self) -> "LikelihoodSurface | None":
-        """Return the likelihood of only the first FIRST rows of recordings, or None if they are shorter than LONG."""
+        """Return the likelihood of only the first FIRST_ROWS (16,384) rows of recordings, which costs little.
+
+        None if recordings are shorter than LONG_RECORDING (131,072) rows.
+        """
         data = self.data
-        if data.measurements.shape[1] < LONG:
+        if data.measurements.shape[1] < LONG_RECORDING:
             return None
         first_rows = LikelihoodData(
-            measurements=data.measurements[:, :FIRST],
-            inputs=data.inputs[:, :FIRST],
-            lengths=tuple(min(length, FIRST) for length in data.lengths),
-            truth=None if data.truth is None else data.truth[:, :FIRST],
+            measurements=data.measurements[:, :FIRST_ROWS],
+            inputs=data.inputs[:, :FIRST_ROWS],
+            lengths=tuple(min(length, FIRST_ROWS) for length in data.lengths),
+            truth=None if data.truth is None else data.truth[:, :FIRST_ROWS],
         )
         return LikelihoodSurface(self.objective, first_rows)
 
     def evaluations(self, x: Float[np.ndarray, "points p"]) -> Evaluation:
-        """Return l, scores and information at each point (points, p); the last result is kept for equal points."""
+        """Return l, scores and information at each point (points, p); the last result is kept for equal points.
+
+        A search asks at the same points for the value, the gradient and the information one after another.
+        """
         if self._last:
             last_points, last_evaluation = self._last[0]
             if np.array_equal(last_points, x):
@@ -99,23 +111,25 @@ class LikelihoodSurface:
         return evaluation.total, evaluation.gradient, evaluation.information
 
     def hessian(self, x: Float[np.ndarray, " p"], active: Bool[np.ndarray, " p"]) -> Float[np.ndarray, "p p"]:
-        """Return the Hessian of -l at x (p, p), by central differences of gradients.
+        """Return the Hessian of -l at x (p, p), by central differences of gradients: the observed information.
 
-        Rows and columns of coordinates that are not `active` (p,), or of which the data know nothing, are those of the
-        information.
+        Rows and columns of coordinates that are not `active` (p,), or of which the data say nothing, are those of the
+        Gauss-Newton information.
         """
         information: np.ndarray = self.evaluations(x[None]).information[0]
-        # Each coordinate is moved by DIFFERENCE standard errors to either side.
+        # Each coordinate is moved by DIFFERENCE_WIDTH standard errors to either side.
         diagonal = np.diag(information)
-        is_told = diagonal > 0
-        width = np.where(is_told, DIFFERENCE / np.sqrt(np.where(is_told, diagonal, 1.0)), 0.0)
-        moving = np.flatnonzero(active & is_told)
+        has_information = diagonal > 0
+        width = np.where(has_information, DIFFERENCE_WIDTH / np.sqrt(np.where(has_information, diagonal, 1.0)), 0.0)
+        moving = np.flatnonzero(active & has_information)
         if not len(moving):
             return information
         shifts = np.zeros((len(moving), len(x)))
         shifts[np.arange(len(moving)), moving] = width[moving]
         gradient = self.evaluations(np.concatenate([x + shifts, x - shifts])).gradient
-        forward, backward = gradient[: len(moving)], gradient[len(moving) :]
+        forward = gradient[: len(moving)]
+        backward = gradient[len(moving) :]
+        # Row i, column j: -(dl/dx_j at x + w_i - dl/dx_j at x - w_i) / (2 w_i).
         block = (-(forward - backward) / (2 * width[moving][:, None]))[:, moving]
         # Made symmetric, as rounding leaves it almost.
         hessian: np.ndarray = information.copy()
@@ -127,11 +141,11 @@ class LikelihoodSurface:
     ) -> list[Float[np.ndarray, "steps k"]]:
         """Return for each recording each row's observed information on k coordinates, -d(score_k)/dx_k, (steps, k).
 
-        By central differences at the point x (p,), over DIFFERENCE standard errors; `coordinates`: their indices.
+        By central differences at the point x (p,), over DIFFERENCE_WIDTH standard errors; `coordinates`: their indices.
         """
         deviation = self.standard_errors(x)[coordinates]
         # A number without a finite standard error is not moved, and has information 0.
-        width = DIFFERENCE * np.where(np.isfinite(deviation), deviation, 0.0)
+        width = DIFFERENCE_WIDTH * np.where(np.isfinite(deviation), deviation, 0.0)
         shifts = np.zeros((len(coordinates), len(x)))
         shifts[np.arange(len(coordinates)), coordinates] = width
         score = self.evaluate_rows(np.concatenate([x + shifts, x - shifts])).score
@@ -170,15 +184,16 @@ class LikelihoodSurface:
         saddle, from which the search goes on along the direction. Only coordinates with `active` (p,) true count, along
         directions that the data identify, and lengths are in standard errors.
         """
-        evaluation, coordinates = self.evaluations(x[None]), np.flatnonzero(active)
+        evaluation = self.evaluations(x[None])
+        coordinates = np.flatnonzero(active)
         information = evaluation.information[0][np.ix_(coordinates, coordinates)]
         gradient = evaluation.gradient[0][coordinates]
         # `unit`: standard error of each coordinate alone, 1 / sqrt(I_ii) of the information I. In these units,
-        # eigenvectors of the information with eigenvalues above FLAT are the identified directions; `basis` has them as
-        # columns.
+        # eigenvectors of the information with eigenvalues above FLAT_EIGENVALUE are the identified directions; `basis`
+        # has them as columns.
         unit = np.where(np.diag(information) > 0, 1 / np.sqrt(np.maximum(np.diag(information), TINY)), 0.0)
         eigenvalues, directions = np.linalg.eigh(information * unit[:, None] * unit)
-        basis = unit[:, None] * directions[:, eigenvalues > FLAT]
+        basis = unit[:, None] * directions[:, eigenvalues > FLAT_EIGENVALUE]
         if not basis.size:
             return LeastCurvature(least=np.inf, direction=np.zeros(len(x)), gain=0.0)
         # The Hessian of -l along these directions. If it is not finite, the gain is unknown, and said to be infinite.
@@ -191,7 +206,7 @@ class LikelihoodSurface:
         direction[coordinates] = basis @ vectors[:, 0]
         # Gain of a Newton step for the gradient g and the Hessian H, g' |H|^-1 g / 2, in eigenvectors of H.
         slopes = vectors.T @ basis.T @ gradient
-        gain = float(np.sum(slopes**2 / np.maximum(np.abs(curvatures), FLAT)) / 2)
+        gain = float(np.sum(slopes**2 / np.maximum(np.abs(curvatures), FLAT_EIGENVALUE)) / 2)
         return LeastCurvature(least=float(curvatures[0]), direction=direction, gain=gain)
 
     def find_profile_crossings(
@@ -224,22 +239,24 @@ class LikelihoodSurface:
         """
         moving = np.repeat((active & (np.arange(len(x)) != coordinate))[None], len(first), axis=0)
         points = np.repeat(x[None], len(first), axis=0)  # where climbs of the other coordinates begin
-        side, target, distance = np.sign(first), np.sqrt(2 * drop), np.abs(first)
-        inside, outside = np.zeros(len(first)), np.full(len(first), np.inf)
-        for _ in range(CUTS):
+        side, distance = np.sign(first), np.abs(first)
+        target = np.sqrt(2 * drop)  # the fall f at an end
+        inside = np.zeros(len(first))
+        outside = np.full(len(first), np.inf)  # distances that bracket each end
+        for _ in range(MOST_CUTS):
             # The profile at these distances: l with the other coordinates at their best.
             points[:, coordinate] = x[coordinate] + side * distance
-            climbed = maximise_from_starts(self.evaluate, points, moving, domains=self.domains, close=ENOUGH)
-            with np.errstate(over="ignore"):  # of an infinite fall
-                fall = np.sqrt(2 * np.maximum(top - np.nan_to_num(climbed.total, nan=-np.inf), 0.0))
+            climbed = maximise_from_starts(self.evaluate, points, moving, domains=self.domains, close=CLOSE_ON_PROFILE)
+            fall = _measure_fall(top, climbed.total)
             # Narrow the bracket: `inside` has not fallen to the target, `outside` has fallen further.
             is_beyond = fall > target
-            inside, outside = np.where(is_beyond, inside, distance), np.where(is_beyond, distance, outside)
+            inside = np.where(is_beyond, inside, distance)
+            outside = np.where(is_beyond, distance, outside)
             points = np.where(is_beyond[:, None], points, climbed.x)
             # Done where the fall is the target, the bracket is closed, or the profile has not fallen at `furthest`.
-            is_there = np.abs(fall - target) < EXACT * target
+            is_there = np.abs(fall - target) < ACCURACY_OF_FALL * target
             never_falls = ~is_beyond & (distance >= furthest)
-            is_closed = outside - inside < EXACT * EXACT * outside
+            is_closed = outside - inside < ACCURACY_OF_FALL * ACCURACY_OF_FALL * outside
             done = is_there | never_falls | is_closed
             if done.all():
                 return np.asarray(x[coordinate] + side * np.where(never_falls & ~is_there, np.inf, distance))
@@ -248,7 +265,16 @@ class LikelihoodSurface:
             with np.errstate(all="ignore"):
                 newton = distance + (target - fall) * fall / (-side * climbed.gradient[:, coordinate])
             distance = np.where(done, distance, _choose_next_distances(newton, distance, inside, outside, furthest))
-        return np.asarray(x[coordinate] + side * distance)  # the last points, after CUTS rounds
+        return np.asarray(x[coordinate] + side * distance)  # the last points, after MOST_CUTS rounds
+
+
+def _measure_fall(top: float, total: np.ndarray) -> np.ndarray:
+    """Return sqrt(2 (top - l)) for log-likelihoods l (`total`); 0 where l is above the top, infinite where it is NaN.
+
+    Where l is quadratic, this fall is proportional to the distance from its maximum.
+    """
+    with np.errstate(over="ignore"):  # of an infinite fall
+        return np.asarray(np.sqrt(2 * np.maximum(top - np.nan_to_num(total, nan=-np.inf), 0.0)))
 
 
 def _choose_next_distances(
@@ -256,8 +282,13 @@ def _choose_next_distances(
 ) -> np.ndarray:
     """Return the distances to look at next (ends,): Newton's if it lies inside the bracket, else the bracket's middle.
 
-    If `outside` is not known yet (infinite), the bracket ends at three times the last `distance`, and this end replaces
-    the middle. No distance is above `furthest`.
+    Args:
+        newton: distances that Newton's method proposes (ends,).
+        distance: distances just looked at (ends,).
+        inside: largest distances known to be nearer than the ends that are sought (ends,).
+        outside: smallest known to be further, infinite where none is known yet (ends,). Then the bracket ends at three
+            times `distance`, and this end is taken in place of the middle.
+        furthest: no distance is above it.
     """
     is_closed = np.isfinite(outside)
     bracket_end = np.minimum(np.where(is_closed, outside, 3 * distance), furthest)
@@ -270,7 +301,7 @@ def _find_ends_at_infinity(parameter: Parameter) -> tuple[Bool[np.ndarray, " siz
     """Return which coordinates of a free number reach an end of its domain at minus infinity, and which at infinity.
 
     Logits (such as of probabilities) have both ends. Logarithms have the end at minus infinity; a covariance has them
-    on its diagonal.
+    on its diagonal. A real number without ends has none.
     """
     domain, none = parameter.domain, np.zeros(parameter.size, dtype=bool)
     if domain.kind == "simplex":

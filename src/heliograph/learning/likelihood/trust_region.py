@@ -1,7 +1,7 @@
 """Trust-region search for the maximum of a likelihood, bounded in standard errors, from several starts side by side.
 
-A climb is one of these searches. Coordinates are unconstrained: logarithms and
-logits, or plain real numbers, which are called free of a scale. A point is a vector of them (p,).
+A climb is one of these searches. Coordinates are unconstrained: logarithms and logits, or plain real numbers, which are
+called free. A point is a vector of them (p,).
 """
 
 from collections.abc import Callable
@@ -19,14 +19,14 @@ from heliograph.numerics.types import Bool, Float
 
 MOST_STEPS = 200
 FIRST_RADIUS = 10.0  # of the trust region, in standard errors
-WIDER, NARROWER = 3.0, 0.25  # factors of the radius after a step that the model predicted well, and badly
-CLOSE = 1e-15  # g' H^-1 g: twice the log-likelihood that a full step gains, 3e-8 standard errors away
-NEAR = 1e-8  # the same where rounding lets nothing better be found: 1e-4 standard errors
-TAKEN = 1e-4  # share of the predicted gain that a step has to bring to be taken
-DEFINED = 1e-8  # r' p / |r| |p| below which it is rounding
-AT_LIMIT = 1e-6  # nats that remain to be gained on the way to the end of a domain
+WIDENING, NARROWING = 3.0, 0.25  # factors of the radius after a step that the model predicted well, and badly
+CONVERGED_GAIN = 1e-15  # g' H^-1 g: twice the log-likelihood that a full step gains, 3e-8 standard errors away
+CONVERGED_GAIN_BY_ROUNDING = 1e-8  # the same where rounding lets nothing better be found: 1e-4 standard errors
+LEAST_SHARE_OF_GAIN = 1e-4  # share of the predicted gain that a step has to bring to be taken
+LEAST_UPDATE_DIVISOR = 1e-8  # |r' p| / (|r| |p|) below which r' p is rounding, in the update of the Hessian
+GAIN_TO_LIMIT = 1e-6  # nats that remain to be gained on the way to the end of a domain
 SMALLEST_RADIUS = 1e-12
-INVISIBLE = 1e-6  # information of a logarithm or a logit of which the likelihood sees next to nothing
+LEAST_INFORMATION = 1e-6  # information of a logarithm or a logit of which the likelihood sees next to nothing
 
 
 def maximise_from_starts(
@@ -35,7 +35,7 @@ def maximise_from_starts(
     active: Bool[np.ndarray, "climbs p"] | None = None,
     watch: Callable[[ClimbEnds], None] | None = None,
     domains: OpenEnds | None = None,
-    close: float = CLOSE,
+    close: float = CONVERGED_GAIN,
     joining: bool = False,
 ) -> ClimbEnds:
     """Return where climbs of the log-likelihood l end, one from each start, all side by side.
@@ -46,7 +46,7 @@ def maximise_from_starts(
     predicted; else the radius falls. So l never falls, and the units of the numbers do not matter.
 
     A climb has converged when g' I^-1 g, twice the gain of the step without bounds, is less than rounding sees. This
-    leaves out coordinates whose domain ends where l still rises, by no more than AT_LIMIT in all.
+    leaves out coordinates whose domain ends where l still rises, by no more than GAIN_TO_LIMIT in all.
 
     Args:
         evaluate: l (climbs,), its gradient (climbs, p) and information (climbs, p, p) at points (climbs, p).
@@ -75,9 +75,16 @@ def maximise_from_starts(
 
 
 def _start_climbs(evaluate: Evaluate, start: np.ndarray, moving: np.ndarray, domains: OpenEnds, close: float) -> Climbs:
-    """Return the state of all climbs before the first step, at the points `start` (climbs, p).
+    """Return the state of all climbs before the first step.
 
-    A climb is done from the beginning where l, or a derivative in a coordinate that moves (`moving`), is not finite.
+    A climb is done from the beginning where l, or a derivative in a coordinate that moves, is not finite.
+
+    Args:
+        evaluate: log-likelihood l (climbs,), gradient (climbs, p) and information (climbs, p, p) at points (climbs, p).
+        start: points at which the climbs begin (climbs, p).
+        moving: coordinates that move (climbs, p).
+        domains: coordinates whose domains end at infinity.
+        close: a climb has arrived where g' I^-1 g of gradient g and information I is below this.
     """
     total, gradient, information = evaluate(start)
     state = Climbs(
@@ -98,7 +105,11 @@ def _start_climbs(evaluate: Evaluate, start: np.ndarray, moving: np.ndarray, dom
 def _is_finite(total: np.ndarray, gradient: np.ndarray, information: np.ndarray, moving: np.ndarray) -> np.ndarray:
     """Return for each climb whether log-likelihood, gradient and information are finite in moving coordinates.
 
-    Shapes: `total` (climbs,), `gradient` and `moving` (climbs, p), `information` (climbs, p, p).
+    Args:
+        total: log-likelihood (climbs,).
+        gradient: (climbs, p).
+        information: (climbs, p, p).
+        moving: coordinates that move (climbs, p); derivatives by others may be anything.
     """
     finite_gradient = np.all(np.isfinite(gradient) | ~moving, axis=1)
     finite_information = np.isfinite(information) | ~(moving[:, :, None] & moving[:, None, :])
@@ -108,23 +119,30 @@ def _is_finite(total: np.ndarray, gradient: np.ndarray, information: np.ndarray,
 def _mark_arrived(state: Climbs, moving: np.ndarray, domains: OpenEnds, close: float) -> Climbs:
     """Return the state with climbs marked as done that have arrived, or whose radius is below SMALLEST_RADIUS.
 
-    A climb has arrived if g' I^-1 g, twice what is left to gain, is below `close`. At so small a radius rounding hides
-    the gain; the climb then counts as converged if the gain is below NEAR.
+    A climb has arrived if g' I^-1 g, twice what a full step would still gain, is below `close`; it has then converged.
+    At so small a radius rounding hides the gain, and CONVERGED_GAIN_BY_ROUNDING takes the place of `close`.
+
+    Args:
+        state: the climbs, with gradient g and information I.
+        moving: coordinates that move (climbs, p); those at an end of their domain count no more.
+        domains: coordinates whose domains end at infinity.
+        close: bound of g' I^-1 g.
     """
     counting = moving & ~find_coordinates_at_limits(state.x, state.gradient, domains)
     remaining = np.where(state.done, state.remaining, expected_gain(state.gradient, state.information, counting) / 2)
     is_stuck = state.radius < SMALLEST_RADIUS
-    has_arrived = ~state.done & (2 * remaining < np.where(is_stuck, NEAR, close))
+    has_arrived = ~state.done & (2 * remaining < np.where(is_stuck, CONVERGED_GAIN_BY_ROUNDING, close))
     return state._replace(
         remaining=remaining, done=state.done | is_stuck | has_arrived, converged=state.converged | has_arrived
     )
 
 
 def find_coordinates_at_limits(x: np.ndarray, gradient: np.ndarray, domains: OpenEnds) -> Bool[np.ndarray, "climbs p"]:
-    """Return which coordinates count as at an end of their domain (climbs, p), as l gains less than AT_LIMIT to it.
+    """Return which coordinates count as at an end of their domain (climbs, p), as l hardly gains on the way there.
 
     A number v = exp(x) has its end v = 0 at x = -inf (`domains.low`). A logit also has one at x = inf (`domains.high`).
-    To first order, the log-likelihood l gains l(0) - l(v) = -v l'(v) = -dl/dx up to the end.
+    To first order, the log-likelihood l gains l(0) - l(v) = -v l'(v) = -dl/dx up to the end; a gain below GAIN_TO_LIMIT
+    (1e-6 nats) counts as none.
 
     Args:
         x: points (climbs, p).
@@ -133,7 +151,7 @@ def find_coordinates_at_limits(x: np.ndarray, gradient: np.ndarray, domains: Ope
     """
     outward = np.where(domains.high & (x > 0), 1.0, np.where(domains.low, -1.0, 0.0))
     rise = outward * gradient
-    return np.asarray((outward != 0) & (rise >= 0) & (rise < AT_LIMIT))
+    return np.asarray((outward != 0) & (rise >= 0) & (rise < GAIN_TO_LIMIT))
 
 
 def _step_climbs(evaluate: Evaluate, state: Climbs, moving: np.ndarray, domains: OpenEnds, close: float) -> Climbs:
@@ -182,7 +200,7 @@ def _accept_or_reject_steps(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return which climbs accept their step, and the radius for the next one, (climbs,) each.
 
-    Lanes are searches side by side. A step is accepted where the log-likelihood l rises by a share of the gain that the
+    A step is accepted where the log-likelihood l rises by a share of the gain that the
     model predicted. Where that gain is below the rounding of l, the gradient decides: the step is accepted if the
     gradient fell, or if the step went to the edge of the region, as across a plateau; and l must not fall by more than
     rounding.
@@ -199,16 +217,23 @@ def _accept_or_reject_steps(
     at_edge = length > 0.9 * state.radius
     is_hidden = predicted < NOISE * np.abs(state.total)
     accepted_if_hidden = (gradient_fell | at_edge) & (gain >= -NOISE * np.abs(total))
-    accepted = is_finite & np.where(is_hidden, accepted_if_hidden, gain > TAKEN * predicted)
+    accepted = is_finite & np.where(is_hidden, accepted_if_hidden, gain > LEAST_SHARE_OF_GAIN * predicted)
     # Wider after a step to the edge that gained three quarters of what was predicted; narrower below one quarter.
     predicted_well = accepted & ((gain > 0.75 * predicted) | is_hidden)
     predicted_badly = ~state.done & ~(is_finite & ((gain > 0.25 * predicted) | (is_hidden & accepted)))
-    widened = np.where(predicted_well & at_edge, WIDER * state.radius, state.radius)
-    return accepted, np.where(predicted_badly, NARROWER * np.minimum(length, state.radius), widened)
+    widened = np.where(predicted_well & at_edge, WIDENING * state.radius, state.radius)
+    return accepted, np.where(predicted_badly, NARROWING * np.minimum(length, state.radius), widened)
 
 
 def _evaluate_at(evaluate: Evaluate, x: np.ndarray, going: np.ndarray, state: Climbs) -> Evaluated:
-    """Return log-likelihood, gradient and information at x (climbs, p) of climbs `going` on, else the last ones."""
+    """Return log-likelihood, gradient and information at x (climbs, p) of climbs `going` on, else the last ones.
+
+    Args:
+        evaluate: function of points (points, p) that returns the three.
+        x: a point for each climb (climbs, p).
+        going: climbs that are evaluated (climbs,); the others are done.
+        state: the climbs, with their last values.
+    """
     arrays = state.total.copy(), state.gradient.copy(), state.information.copy()
     for array, new_values in zip(arrays, evaluate(x[going]), strict=True):
         array[going] = new_values
@@ -241,7 +266,8 @@ def _update_hessian(
         accepted: whether the climb moves to the end of the step (climbs,).
         free: coordinates that are plain real numbers, no logarithms or logits (p,).
     """
-    last_model, last_information = np.nan_to_num(state.model), np.nan_to_num(state.information)
+    last_model = np.nan_to_num(state.model)
+    last_information = np.nan_to_num(state.information)
     # The gain that each of the two models would have predicted, g' p - p' B p / 2.
     slope = np.sum(state.gradient * step, axis=1)
     by_model = slope - np.sum(step * multiply_each(last_model, step), axis=1) / 2
@@ -278,14 +304,17 @@ def _correct_by_secant(
     """
     y = np.where(is_finite[:, None], np.nan_to_num(state.gradient - gradient), 0.0)
     r = y - multiply_each(model, step)
-    # The likelihood hardly depends on a logarithm or logit with so little information: y is but rounding there.
-    diagonal = np.diagonal(state.information, axis1=1, axis2=2)
-    r = np.where(free | (diagonal > INVISIBLE), r, 0.0)
-    # r' p counts where it is more than rounding of |r| |p|, both in units of standard errors.
-    r_times_step = np.sum(r * step, axis=1)
-    unit, _ = find_errors_and_flat_directions(state.information, step != 0)
-    squared_r, squared_step = (r * unit) ** 2, (step / np.where(unit > 0, unit, 1.0)) ** 2
-    size = np.sqrt(np.sum(squared_r, axis=1) * np.sum(squared_step, axis=1))
-    is_defined = is_finite & (np.abs(r_times_step) > DEFINED * size)
-    update = r[:, :, None] * r[:, None, :] / np.where(is_defined, r_times_step, 1.0)[:, None, None]
+    # A logarithm or logit with information below LEAST_INFORMATION hardly changes the likelihood: there y is only
+    # rounding.
+    information_of_each = np.diagonal(state.information, axis1=1, axis2=2)
+    r = np.where(free | (information_of_each > LEAST_INFORMATION), r, 0.0)
+    # The update is defined where |r' p| > LEAST_UPDATE_DIVISOR |r| |p|; less is rounding. Sizes are in units of each
+    # coordinate's standard error u = 1 / sqrt(I_ii), so that units of the numbers do not matter: |r| of r u, and |p| of
+    # p / u.
+    r_times_p = np.sum(r * step, axis=1)
+    standard_error, _ = find_errors_and_flat_directions(state.information, moving=step != 0)
+    squared_r = np.sum((r * standard_error) ** 2, axis=1)
+    squared_p = np.sum((step / np.where(standard_error > 0, standard_error, 1.0)) ** 2, axis=1)
+    is_defined = is_finite & (np.abs(r_times_p) > LEAST_UPDATE_DIVISOR * np.sqrt(squared_r * squared_p))
+    update = r[:, :, None] * r[:, None, :] / np.where(is_defined, r_times_p, 1.0)[:, None, None]
     return model + np.where(is_defined[:, None, None], update, 0.0)

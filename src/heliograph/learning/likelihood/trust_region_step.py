@@ -6,17 +6,23 @@ import numpy as np
 
 from heliograph.numerics.types import Bool, Float
 
-FLAT = 1e-10  # eigenvalue of the scaled information below which a direction is not identified
+FLAT_EIGENVALUE = 1e-10  # eigenvalue of the scaled information below which a direction is not identified
 SECULAR_STEPS = 20  # Newton steps for the shift s at most; a few are enough
-LONGEST = 5.0  # step of a logarithm or a logit: a factor of 150
+LONGEST_LOGARITHM = 5.0  # step of a logarithm or a logit: a factor of 150
 ROUNDING = 1e-14  # of a matrix's eigenvalues, as a share of the largest
-PAST = 1e-6  # relative: how far beyond the least shift that makes a matrix positive the search begins
-LEAST = 1e-150  # information, of which the square is a number
-LARGEST = 1e12  # curvature in units of standard errors: beyond this a model is taken for rounding
+MARGIN_OF_SHIFT = 1e-6  # relative: how far beyond the least shift that makes a matrix positive the search begins
+LEAST_INFORMATION = 1e-150  # information, of which the square is a number
+LARGEST_CURVATURE = 1e12  # curvature in units of standard errors: beyond this a model is taken for rounding
 
 
 class TrustRegionStep(NamedTuple):
-    """Steps p of all climbs, their lengths |D p|, and the gains that the model predicts, g' p - p' B p / 2."""
+    """The next step of each climb.
+
+    Args:
+        step: p, the change of the point (climbs, p).
+        length: its length |D p| in the units of the trust region's radius, standard errors (climbs,).
+        predicted: gain of log-likelihood that the model predicts, g' p - p' B p / 2, in nats (climbs,).
+    """
 
     step: Float[np.ndarray, "climbs p"]
     length: Float[np.ndarray, " climbs"]
@@ -37,9 +43,9 @@ def trust_region_step(
     it is found by Newton's method for 1 / |D p| = 1 / radius.
 
     All is computed in units u of standard errors, in which B is of order 1; scaled by a diagonal, a matrix is solved as
-    exactly as without. D is 1, but max(1, radius u / LONGEST) where a logarithm moves, so that it moves by LONGEST at
-    most. To B is added v v' for each direction v that is not identified: its gradient is but rounding, and would else
-    lead far.
+    exactly as without. D is 1, but max(1, radius u / LONGEST_LOGARITHM) where a logarithm moves, so that it moves by
+    LONGEST_LOGARITHM at most. To B is added v v' for each direction v that is not identified: its gradient is but
+    rounding, and would else lead far.
 
     Args:
         gradient: g (climbs, p).
@@ -48,7 +54,7 @@ def trust_region_step(
             the information takes its place.
         radius: of the trust region (climbs,).
         moving: which coordinates may move (climbs, p).
-        free: which are no logarithms or logits, and so not limited by LONGEST (p,).
+        free: which are no logarithms or logits, and so not limited by LONGEST_LOGARITHM (p,).
 
     Returns:
         p (climbs, p), |D p| (climbs,) and g' p - p' B p / 2 (climbs,).
@@ -57,7 +63,7 @@ def trust_region_step(
     # its step is 0. Columns of `flat` are the directions that are not identified, in these units.
     unit, flat = find_errors_and_flat_directions(information, moving)
     stays = unit == 0
-    d = np.where(free | stays, 1.0, np.maximum(1.0, radius[:, None] * unit / LONGEST))
+    d = np.where(free | stays, 1.0, np.maximum(1.0, radius[:, None] * unit / LONGEST_LOGARITHM))
     g = np.nan_to_num(gradient) * unit
     b = _scale_model(model, information, unit)
     b = (b + b.swapaxes(1, 2)) / 2 + flat @ flat.swapaxes(1, 2) + np.eye(len(free)) * stays[:, :, None]
@@ -65,7 +71,8 @@ def trust_region_step(
     step = _find_step_within(radius, g, b, d)
     length = np.linalg.norm(d * step, axis=1)
     factor = np.minimum(1.0, radius / np.where(length > 0, length, 1.0))
-    step, length = step * factor[:, None], length * factor
+    step = step * factor[:, None]
+    length = length * factor
     # What the model gains there: g' p - p' B p / 2.
     predicted = np.sum(step * (g - multiply_each(b, step) / 2), axis=1)
     return TrustRegionStep(step=step * unit, length=length, predicted=predicted)
@@ -75,22 +82,28 @@ def _scale_model(model: np.ndarray, information: np.ndarray, unit: np.ndarray) -
     """Return U B U (climbs, p, p) for each climb's model B, or for its information if B is huge or not finite.
 
     U = diag(unit), with the standard errors `unit` (climbs, p). A climb is one of several searches side by side.
-    LARGEST: a curvature beyond it, in these units, is only rounding.
+    LARGEST_CURVATURE: a curvature beyond it, in these units, is only rounding.
     """
     scaled_model = _scale_both_sides(model, unit)
-    is_usable = np.all(np.abs(scaled_model) < LARGEST, axis=(1, 2))  # neither huge nor NaN
+    is_usable = np.all(np.abs(scaled_model) < LARGEST_CURVATURE, axis=(1, 2))  # neither huge nor NaN
     return np.where(is_usable[:, None, None], scaled_model, _scale_both_sides(information, unit))
 
 
 def _find_step_within(radius: np.ndarray, g: np.ndarray, b: np.ndarray, d: np.ndarray) -> np.ndarray:
     """Return p = (B + s D^2)^-1 g (climbs, p) with the least shift s >= 0 that keeps |D p| within 1.01 of the radius.
 
-    `radius` (climbs,), g (climbs, p), b: B (climbs, p, p), d: the diagonal of D (climbs, p). Newton's method for
-    1 / |D p| = 1 / radius, from the least s that makes the matrix positive.
+    The shift is found by Newton's method for 1 / |D p| = 1 / radius, which is nearly linear in s. It begins at the
+    least s that makes the matrix positive.
+
+    Args:
+        radius: of the trust region (climbs,).
+        g: gradient (climbs, p).
+        b: B, minus the Hessian or near it (climbs, p, p).
+        d: diagonal of D (climbs, p).
     """
     # D^-1 B D^-1 + s I is positive for s above minus the least eigenvalue.
     least = np.linalg.eigvalsh(b / d[:, :, None] / d[:, None, :])[:, 0]
-    shift = np.where(least > -ROUNDING, 0.0, -least * (1 + PAST))
+    shift = np.where(least > -ROUNDING, 0.0, -least * (1 + MARGIN_OF_SHIFT))
     for _ in range(SECULAR_STEPS):
         step = _solve_shifted(b, shift, d, g)
         length = np.linalg.norm(d * step, axis=1)
@@ -106,8 +119,13 @@ def _find_step_within(radius: np.ndarray, g: np.ndarray, b: np.ndarray, d: np.nd
 def _solve_shifted(b: np.ndarray, shift: np.ndarray, d: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Return (B + s D^2)^-1 r of each climb (climbs, p), or 0 along directions in which the matrix is singular.
 
-    `b`: B (climbs, p, p). `shift`: s (climbs,). `d`: the diagonal of D (climbs, p). `right`: r (climbs, p). A climb is
-    one of several searches side by side. An eigenvalue below ROUNDING times the largest counts as 0.
+    An eigenvalue below ROUNDING times the largest counts as 0.
+
+    Args:
+        b: B of each climb, one of several searches side by side (climbs, p, p).
+        shift: s (climbs,).
+        d: diagonal of D (climbs, p).
+        right: r (climbs, p).
     """
     matrix = b + (shift[:, None] * d * d)[:, :, None] * np.eye(b.shape[1])
     try:
@@ -122,13 +140,18 @@ def expected_gain(
     """Return g' I^-1 g (climbs,), twice what a full step gains: gradient g (climbs, p), information I (climbs, p, p).
 
     Only coordinates marked in `counting` (climbs, p) and identified directions count. A direction with an eigenvalue of
-    at most FLAT, in units of standard errors, is not identified.
+    at most FLAT_EIGENVALUE, in units of standard errors, is not identified.
+
+    Args:
+        gradient: g (climbs, p).
+        information: I (climbs, p, p).
+        counting: coordinates that count (climbs, p).
     """
     unit, _ = find_errors_and_flat_directions(information, counting)
     scaled = _scale_both_sides(information, unit)
     eigenvalues, vectors = np.linalg.eigh((scaled + scaled.swapaxes(1, 2)) / 2)
     components = np.einsum("lij,li->lj", vectors, np.nan_to_num(gradient) * unit)  # of g along the eigenvectors
-    is_identified = eigenvalues > FLAT
+    is_identified = eigenvalues > FLAT_EIGENVALUE
     gains = np.where(is_identified, components**2 / np.where(is_identified, eigenvalues, 1.0), 0.0)
     return np.asarray(np.sum(gains, axis=1))
 
@@ -138,16 +161,20 @@ def find_errors_and_flat_directions(information: np.ndarray, moving: np.ndarray)
 
     Each climb is a point with its `information` I (climbs, p, p); the errors are 1 / sqrt(I_ii), or 0 of coordinates
     that are not `moving`. A flat direction is an eigenvector of I_ij / sqrt(I_ii I_jj) without information, eigenvalue
-    <= FLAT. It is a column of the result (climbs, p, p), in units of the errors; the columns of other eigenvectors are
-    0.
+    <= FLAT_EIGENVALUE. It is a column of the result (climbs, p, p), in units of the errors; the columns of other
+    eigenvectors are 0.
+
+    Args:
+        information: I of each climb (climbs, p, p).
+        moving: coordinates that move (climbs, p).
     """
     diagonal = np.diagonal(information, axis1=1, axis2=2)
-    # Information below LEAST counts as none, since its square would underflow.
-    has_information = moving & (diagonal > LEAST) & np.isfinite(diagonal)
+    # Information below LEAST_INFORMATION counts as none, since its square would underflow.
+    has_information = moving & (diagonal > LEAST_INFORMATION) & np.isfinite(diagonal)
     errors = np.where(has_information, 1 / np.sqrt(np.where(has_information, diagonal, 1.0)), 0.0)
     scaled = _scale_both_sides(information, errors)
     eigenvalues, vectors = np.linalg.eigh((scaled + scaled.swapaxes(1, 2)) / 2)
-    is_flat = eigenvalues <= FLAT
+    is_flat = eigenvalues <= FLAT_EIGENVALUE
     return errors, np.where(is_flat[:, None, :], vectors, 0.0) * has_information[:, :, None]
 
 

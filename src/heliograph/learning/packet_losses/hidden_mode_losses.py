@@ -10,7 +10,7 @@ from heliograph.model.fading import gilbert_elliott
 from heliograph.random_affine.base import AbstractRandomAffine
 
 STEP = 1e-20  # of the complex step, whose error is its square
-UNKNOWN, START = 2, 3  # kinds of runs of packets, after arrived (0) and lost (1)
+UNKNOWN, START = 2, 3  # codes of a packet of unknown fate and of the start of a stretch, besides 0 arrived and 1 lost
 
 STARTS = (  # loss when good, loss when bad, fail, recover: bursts, long spells, two rates that hardly differ
     logits(0.02, 0.9, 0.05, 0.5),
@@ -53,12 +53,14 @@ class HiddenModeLosses(AbstractLossLaw):
         stretches = check_fates(fates)
         # A stretch cut where packets arrived (its ends are CHOSEN) counts as log P(fates) - log P(both ends arrive).
         chosen = [keep_ends_only(fate) for fate in stretches if fate[-1] == CHOSEN]
-        whole, ends = FateRuns.of([fill_ends(fate) for fate in stretches]), FateRuns.of(chosen) if chosen else None
+        whole = FateRuns.of([fill_ends(fate) for fate in stretches])
+        ends = FateRuns.of(chosen) if chosen else None
 
         def likelihood(x: np.ndarray) -> tuple[float, np.ndarray]:
             """Return log P(fates) - log P(ends arrive) at the logits x, and its gradient.
 
-            The second term is for stretches that were chosen to end with an arrival; `ends` is None if there are none.
+            `whole` has all stretches. The second term is for stretches that were chosen to end with an arrival: `ends`
+            has these ends alone, and is None if there are none.
             """
             value, gradient = whole.likelihood(x)
             if ends is None:
@@ -77,10 +79,16 @@ class HiddenModeLosses(AbstractLossLaw):
         return {name: getattr(self, name) for name in ("good_loss", "bad_loss", "fail", "recover")}
 
     def predicted(self, fate: Packets) -> Packets:
-        """Return the probability of each loss by the filter of the mode: P(lost) = sum_i P(mode i | past) loss_i."""
+        """Return the probability of each packet's loss (packets,), given the fates before it.
+
+        P(lost) = sum_i P(mode i | fates before) P(lost | mode i), by a filter of the two modes: a known fate changes
+        the probabilities of the modes by Bayes' rule, then the chain moves them to the next packet. `fate`: 0 arrived,
+        1 lost, NaN unknown.
+        """
         good, bad, fails, recovers = (share.estimate for share in self.shares().values())
         away = fails + recovers
-        is_bad = fails / away if away else 0.5  # two modes that never change: nobody knows which it is
+        # P(bad mode), from the stationary law on; of two modes that never change nobody knows which it is.
+        is_bad = fails / away if away else 0.5
         probabilities = np.zeros(len(fate))
         for k, observed in enumerate(fate.tolist()):
             p = (1 - is_bad) * good + is_bad * bad
@@ -114,18 +122,29 @@ class FateRuns:
     def __init__(self, kind: np.ndarray, length: np.ndarray):
         """Store for each kind which runs have it, their distinct lengths, and which of these lengths each run has.
 
-        A run is a row of packets of one kind: a fate that they share, or a single START. `length`: its number of
-        packets.
+        A run is a row of packets of one kind: a fate that they share, or a single START. Runs of one kind and length
+        share a matrix power, which is computed once.
+
+        Args:
+            kind: of each run: 0 arrived, 1 lost, UNKNOWN, or START (runs,).
+            length: number of packets in each run (runs,).
         """
         self.kind = kind
-        masks = {int(fate): kind == fate for fate in np.unique(kind)}
-        self.runs_by_kind = {
-            fate: (mask, *np.unique(length[mask], return_inverse=True)) for fate, mask in masks.items()
-        }
+        self.runs_by_kind: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
+        for fate in np.unique(kind):
+            has_kind = kind == fate
+            distinct_lengths, length_of_run = np.unique(length[has_kind], return_inverse=True)
+            self.runs_by_kind[int(fate)] = has_kind, distinct_lengths, length_of_run
 
     @staticmethod
     def of(fates: Fates) -> "FateRuns":
-        """Return the runs of equal fates in some stretches (packets,), each stretch after a START."""
+        """Return the runs of equal fates in some stretches (packets,), each stretch after a START.
+
+        A run is a row of successive packets with the same fate; the likelihood has one factor for each.
+
+        Args:
+            fates: fates of each stretch (packets,): 0 arrived, 1 lost, NaN unknown.
+        """
         # Write fates as whole numbers: 0 arrived, 1 lost, or UNKNOWN.
         code = np.concatenate([[START, *np.where(np.isnan(f), UNKNOWN, f).tolist()] for f in fates]).astype(int)
         begins_run = np.concatenate([[True], (np.diff(code) != 0) | (code[1:] == START)])

@@ -16,17 +16,19 @@ from heliograph.numerics.check import fail, scalar
 from heliograph.numerics.module import readable
 from heliograph.random_affine.base import AbstractRandomAffine
 
-INDEPENDENT, HIDDEN, RUNNING = "independent", "hidden", "running"
+INDEPENDENT, HIDDEN, RUNNING = "independent", "hidden", "running"  # names of laws
 
-LONG = 4  # packets back that the longer of the two chains looks
-LEVEL = 0.01  # probability that independent losses are said to have memory
+LONG_ORDER = 4  # packets back that the longer of the two chains looks
+TEST_LEVEL = 0.01  # probability that independent losses are said to have memory
 
 
 class HeldOutScores(NamedTuple):
     """Scores of a law on packets that it was not fitted to.
 
-    log_likelihood: mean over packets, nats. gain: difference from that of independent losses; gain_error: its standard
-    error, which allows for correlation over time.
+    Args:
+        log_likelihood: mean of log P(fate | fates before) over these packets, in nats.
+        gain: how much larger it is than that of independent losses.
+        gain_error: standard error of the gain, which allows for correlation over time.
     """
 
     log_likelihood: float
@@ -81,7 +83,8 @@ class LossMemory(NamedTuple):
         for stretch in check_fates(fates):
             # Of a stretch between arrivals the packets between them, which are exchangeable if losses are independent.
             for lost in _split_at_unknown(np.where(find_trials(stretch), stretch, np.nan)):
-                n, losses = len(lost), float(lost.sum())
+                n = len(lost)
+                losses = float(lost.sum())
                 pairs = 2 * losses * (n - losses)  # 2 n1 n0
                 runs = 1 + np.sum(np.diff(lost) != 0)
                 excess += runs - (1 + pairs / n)
@@ -167,14 +170,20 @@ def learn_losses(fates: object, held_out: float = 1 / 3) -> Losses:
 def _find_significant_laws(laws: dict[str, AbstractLossLaw], parts: Fates) -> set[str]:
     """Return the names of the laws that a likelihood ratio test prefers to independent losses.
 
-    All tests together have the level LEVEL.
+    Twice the gain of log-likelihood is chi-square if losses are independent, with a degree of freedom for each further
+    probability that a law has. All tests together have the level TEST_LEVEL (1 %).
+
+    Args:
+        laws: fitted laws by name.
+        parts: stretches of fates to which they were fitted.
     """
-    level = LEVEL / (len(laws) - 1)  # shared by the tests of all laws but "independent"
+    level = TEST_LEVEL / (len(laws) - 1)  # shared by the tests of all laws but "independent"
     total = {name: float(np.nansum(law.log_likelihoods(parts))) for name, law in laws.items()}
     significant = set[str]()
     for name, law in laws.items():
         # Independent losses have one number, so a law's further numbers are its degrees of freedom.
-        ratio, freedom = 2 * (total[name] - total[INDEPENDENT]), len(law.shares()) - 1
+        ratio = 2 * (total[name] - total[INDEPENDENT])
+        freedom = len(law.shares()) - 1
         if name != INDEPENDENT and scipy.stats.chi2.sf(ratio, freedom) < level:
             significant.add(name)
     return significant
@@ -183,7 +192,11 @@ def _find_significant_laws(laws: dict[str, AbstractLossLaw], parts: Fates) -> se
 def _choose_law(significant: set[str], held_out: dict[str, HeldOutScores]) -> str:
     """Return the name of the law with the largest held-out likelihood, among independent losses and significant laws.
 
-    Without scores it is HIDDEN if that law is significant, else INDEPENDENT.
+    Without scores it is that of hidden modes (HIDDEN) if it is significant, else INDEPENDENT.
+
+    Args:
+        significant: names of the laws that a test prefers to independent losses.
+        held_out: scores of the laws on packets that they were not fitted to, by name; empty if there are none.
     """
     if not held_out:
         return HIDDEN if HIDDEN in significant else INDEPENDENT
@@ -194,23 +207,32 @@ def _choose_law(significant: set[str], held_out: dict[str, HeldOutScores]) -> st
 def _fit_laws(parts: Fates, intervals: bool) -> dict[str, AbstractLossLaw]:
     """Return the five laws fitted to stretches of fates, by name; intervals of their numbers only if asked for.
 
-    One Markov law looks back over one packet, the other over LONG packets. HIDDEN has a good and a bad mode that are
-    not seen. RUNNING follows the share of losses as it drifts.
+    One Markov law looks back over one packet, the other over LONG_ORDER packets. HIDDEN has a good and a bad mode that
+    are not seen. RUNNING follows the share of losses as it drifts.
+
+    Args:
+        parts: stretches of fates: 0 arrived, 1 lost, NaN unknown.
+        intervals: whether to compute the intervals.
     """
     return {
         INDEPENDENT: IndependentLosses.fit(parts),
         "markov": MarkovLosses.fit(parts, intervals=intervals),
-        f"markov_{LONG}": MarkovLosses.fit(parts, LONG),
+        f"markov_{LONG_ORDER}": MarkovLosses.fit(parts, LONG_ORDER),
         HIDDEN: HiddenModeLosses.fit(parts, intervals),
         RUNNING: RunningRateLosses.fit(parts, intervals),
     }
 
 
 def _score_held_out(parts: Fates, known: np.ndarray, cut: int) -> dict[str, HeldOutScores]:
-    """Return the scores of the laws on later packets by name, when the laws are fitted to the first `cut` trials.
+    """Return the scores of the laws on later packets by name, when the laws are fitted to the earlier ones.
 
-    Each later packet is predicted from all packets before it. `parts`: stretches of fates. `known`: which packets are
-    trials, stretch after stretch.
+    Each later packet is predicted from all packets before it.
+
+    Args:
+        parts: stretches of fates: 0 arrived, 1 lost, NaN unknown.
+        known: which packets count, of all stretches one after the other: those with a known fate, except ends that were
+            chosen because they arrived.
+        cut: how many of the packets that count the laws are fitted to, the first ones.
     """
     is_held_out = known & (np.cumsum(known) > cut)
     # Hide later fates as unknown, so that the laws are fitted to the first `cut` trials.
@@ -226,7 +248,10 @@ def _score_held_out(parts: Fates, known: np.ndarray, cut: int) -> dict[str, Held
 
 
 def _compute_maximum_log_likelihood(counts: np.ndarray) -> float:
-    """Return the maximum of the log-likelihood of counts n_ab (past a, fate b): sum n_ab log(n_ab / n_a)."""
+    """Return the largest log-likelihood of counts n_ab, (pasts, fates), over all P(b | a): sum n_ab log(n_ab / n_a).
+
+    n_ab is how often fate b followed past a, and n_a = sum_b n_ab.
+    """
     rows = counts.sum(axis=1, keepdims=True)
     return float(np.sum(xlogy(counts, counts / np.where(rows > 0, rows, 1.0))))
 
@@ -265,10 +290,14 @@ class RunningRateLosses(AbstractLossLaw):
         # Packets of unknown fate are left out. Ends at which a stretch was cut because they arrived are no trials, and
         # become 0 (arrived), so that the law of the packets after them knows it.
         known = [stretch[~np.isnan(stretch)] for stretch in check_fates(fates)]
-        trials, stretches = [find_trials(stretch) for stretch in known], [fill_ends(stretch) for stretch in known]
+        trials = [find_trials(stretch) for stretch in known]
+        stretches = [fill_ends(stretch) for stretch in known]
 
         def likelihood(x: np.ndarray) -> tuple[float, np.ndarray]:
-            """Return the log-likelihood at the logits x (3,) of base, weight and step, and its gradient (3,)."""
+            """Return the log-likelihood at the logits x (3,) of base, weight and step, and its gradient (3,).
+
+            `stretches` are the known fates, and `trials` says which of them count.
+            """
             # The derivative of a share p by its logit is p (1 - p).
             share = expit(x)
             total, gradient = 0.0, np.zeros(len(x))
@@ -285,7 +314,11 @@ class RunningRateLosses(AbstractLossLaw):
         return {name: getattr(self, name) for name in ("base", "weight", "step")}
 
     def predicted(self, fate: Packets) -> Packets:
-        """Return the probability of each loss by the running rate, which an unknown fate does not change."""
+        """Return the probability of each loss by the running rate, which an unknown fate does not change.
+
+        `fate` (packets,): 0 arrived, 1 lost, NaN unknown. The rate is followed over the known fates alone, and each
+        packet takes the one after the last known fate before it.
+        """
         known = ~np.isnan(fate)
         base, weight, step = (share.estimate for share in self.shares().values())
         # The probability of loss after 0, 1, ..., all known fates.
@@ -300,12 +333,16 @@ def _predict_losses(lost: Packets, base: float, weight: float, step: float) -> t
     P(lost) = base + weight d, where d+ = (1 - step) d + step (lost - base) follows the fates, from d = 0 on. Its
     derivatives follow recursions of the same form, so all run as linear filters. `lost`: the fates, 1 for a loss.
     """
-    last_fate = np.concatenate([[0.0], lost - base])[:-1] if len(lost) else lost
-    keep = [1.0, step - 1.0]
-    d = scipy.signal.lfilter([step], keep, last_fate)
-    by_base = scipy.signal.lfilter([step], keep, np.concatenate([[0.0], -np.ones(len(lost))])[: len(lost)])
-    by_step = scipy.signal.lfilter([1.0], keep, np.concatenate([[0.0], (lost - base - d)])[: len(lost)])
-    return base + weight * d, np.stack([1 + weight * by_base, d, weight * by_step])
+    recursion = [1.0, step - 1.0]  # lfilter([b], recursion, x) is y_k = (1 - step) y_(k-1) + b x_k
+
+    def delay(x: Packets) -> Packets:
+        """Return x one packet later, from 0 on: a packet's probability depends on the fates before it."""
+        return np.concatenate([[0.0], x])[: len(x)]
+
+    d = scipy.signal.lfilter([step], recursion, delay(lost - base))
+    d_by_base = scipy.signal.lfilter([step], recursion, delay(-np.ones(len(lost))))
+    d_by_step = scipy.signal.lfilter([1.0], recursion, delay(lost - base - d))
+    return base + weight * d, np.stack([1 + weight * d_by_base, d, weight * d_by_step])
 
 
 def _sum_log_probabilities(
@@ -318,5 +355,6 @@ def _sum_log_probabilities(
     """
     p, slope = predictions
     p = np.clip(p, 1e-300, 1 - 1e-16)  # so that both logarithms are finite
-    logs, score = np.where(lost == 1, np.log(p), np.log1p(-p)), (lost - p) / (p * (1 - p))
-    return float(np.sum(logs[trials])), slope @ np.where(trials, score, 0.0)
+    log_probability = np.where(lost == 1, np.log(p), np.log1p(-p))
+    score = (lost - p) / (p * (1 - p))  # dl/dp of each packet
+    return float(np.sum(log_probability[trials])), slope @ np.where(trials, score, 0.0)

@@ -1,4 +1,8 @@
-"""Laws of losses: the probability that a packet is lost, given what became of those before it."""
+"""Laws of losses: the probability that a packet is lost, given what became of those before it.
+
+The fate of a packet is 0 if it arrived, 1 if it was lost, NaN if that is not known, and CHOSEN (2) if it arrived and is
+an end of its stretch for that reason (`packet_fates.py`).
+"""
 
 from typing import NamedTuple, TypeVar
 
@@ -21,20 +25,24 @@ Packets = Float[np.ndarray, " packets"]
 
 @readable
 class AbstractLossLaw(Module):
-    """Law of observed losses. Subclasses define `shares`, `predicted`, and `channel` where one has such losses.
+    """Law of the losses of packets, fitted to recorded fates: 0 arrived, 1 lost, NaN unknown.
 
-    The log-likelihood of a recording is the sum of log P(fate | fates before) over the packets whose fate is known;
-    each stretch starts in the stationary law. Of a stretch between two packets that are its ends because they arrived
-    (`fates_of_sequence`) it is that of the packets between, given that both ends arrived:
-    log P(fates) - log P(ends), where P(ends) is the probability that the two arrive, whatever became of the others.
+    Subclasses define `shares`, `predicted`, and `channel` where a channel can have such losses. The log-likelihood of a
+    recording is the sum of log P(fate | fates before) over the packets whose fate is known; each stretch starts in the
+    stationary law. Of a stretch between two packets that are its ends because they arrived (`fates_of_sequence`) it is
+    that of the packets between, given that both ends arrived: log P(fates) - log P(ends), where P(ends) is the
+    probability that the two arrive, whatever became of the others.
     """
 
     def shares(self) -> dict[str, Share]:
-        """Return the estimates with their intervals, by name."""
+        """Return the probabilities that the law has, by name, as estimates with their 95 % intervals."""
         raise unwritten(self, "shares")
 
     def predicted(self, fate: Packets) -> Packets:
-        """Return the probability that each packet of a stretch is lost, given those before it."""
+        """Return the probability that each packet of a stretch is lost, given the fates of those before it (packets,).
+
+        `fate`: fates of the stretch: 0 arrived, 1 lost, NaN unknown.
+        """
         raise unwritten(self, "predicted")
 
     def channel(self, link: AbstractRandomAffine) -> AbstractRandomAffine:
@@ -46,10 +54,14 @@ class AbstractLossLaw(Module):
         raise fail(f"channel with {type(self).__name__}", "a law with finitely many states", "a rate that drifts")
 
     def log_likelihoods(self, fates: object) -> Packets:
-        """Return log P(fate | those before) of each packet of all stretches; NaN where the fate is unknown.
+        """Return log P(fate | fates before it) of each packet of all stretches; NaN where the fate is unknown.
 
         A stretch may have been cut where packets arrived. Its likelihood is then P(fates) / P(last arrives | first
         arrived), since its end says nothing; the last packet's entry is reduced by the logarithm of that probability.
+
+        Args:
+            fates: stretches of packets in order of sending, 0 (arrived), 1 (lost) or NaN (unknown); one array or
+                several.
 
         Raises:
             ValueError: what is no fates (see `heliograph.learning`).
@@ -57,21 +69,24 @@ class AbstractLossLaw(Module):
         return np.concatenate([self._score_stretch(stretch) for stretch in check_fates(fates)])
 
     def _score_stretch(self, fate: Packets) -> Packets:
-        """Return log P(fate | earlier fates) of each packet of a stretch (packets,), or NaN if the fate is unknown.
+        """Return log P(fate | earlier fates) of each packet of a stretch (packets,), or NaN if its fate is unknown.
 
-        A stretch that was cut where packets arrived has CHOSEN as its first and last fate. Its last entry becomes
-        log P(last arrived | all earlier fates) - log P(last arrived | first arrived), so that the sum of entries is the
-        log-likelihood given that both ends arrived.
+        A fate is 0 (arrived), 1 (lost) or NaN (unknown). If the stretch was cut where packets arrived, its first and
+        last fate are CHOSEN: they arrived, but say nothing of losses. The first has NaN. The sum of all entries has to
+        be log P(fates between, last arrives | first arrived) - log P(last arrives | first arrived), so the last entry
+        is log P(last arrives | all earlier fates) - log P(last arrives | first arrived).
         """
-        p = self.predicted(fill_ends(fate))
+        p = self.predicted(fill_ends(fate))  # P(lost) of each packet; chosen ends count as arrived for those after them
         with np.errstate(divide="ignore"):
-            logs: Packets = np.where(find_trials(fate), np.where(fate == 1, np.log(p), np.log1p(-p)), np.nan)
+            log_probability = np.where(fate == 1, np.log(p), np.log1p(-p))
+        logs: Packets = np.where(find_trials(fate), log_probability, np.nan)  # trials: fates of 0 and 1
         if fate[-1] == CHOSEN and len(fate) > 2:
-            logs[-1] = np.log1p(-p[-1]) - np.log(self._compute_return_probability(len(fate) - 1))
+            last_given_first = self._compute_return_probability(steps=len(fate) - 1)
+            logs[-1] = np.log1p(-p[-1]) - np.log(last_given_first)
         return logs
 
     def _compute_return_probability(self, steps: int) -> float:
-        """Return P(arrived after this number of steps | arrived now), with the fates of the packets between unknown."""
+        """Return P(a packet arrives | the packet `steps` before it arrived), if nothing is known of those between."""
         fate = np.full(steps + 1, np.nan)
         fate[0] = 0.0
         return 1.0 - float(self.predicted(fate)[-1])
@@ -90,24 +105,35 @@ class IndependentLosses(AbstractLossLaw):
 
     @staticmethod
     def fit(fates: object) -> "IndependentLosses":
-        """Return the law of the share of losses, by counting.
+        """Return the law whose probability of a loss is the share of lost packets, by counting.
+
+        Packets count if their fate is known, except the ends of a stretch that was cut where packets arrived
+        (`fates_of_sequence`): they could not have been lost.
+
+        Args:
+            fates: stretches of packets in order of sending, 0 (arrived), 1 (lost) or NaN (unknown); one array or
+                several.
 
         Raises:
             ValueError: an argument that is no fates.
         """
-        known = np.concatenate(check_fates(fates))
-        return IndependentLosses(int(np.sum(known == 1)), int(np.sum(find_trials(known))))
+        all_fates = np.concatenate(check_fates(fates))
+        is_counted = find_trials(all_fates)  # fates of 0 and 1; `check_fates` marks chosen ends by another value
+        return IndependentLosses(lost=int(np.sum(all_fates == 1)), packets=int(np.sum(is_counted)))
 
     def shares(self) -> dict[str, Share]:
         """Return the share of losses, lost / packets, with Wilson's interval."""
         return {"loss": wilson(self.lost, self.packets)}
 
     def predicted(self, fate: Packets) -> Packets:
-        """Return the probability (k + 1/2) / (n + 1) of each loss, so that none is impossible."""
+        """Return the probability of each packet's loss, (k + 1/2) / (n + 1) for k losses among n packets, (packets,).
+
+        So neither a loss nor an arrival is impossible.
+        """
         return np.full(len(fate), (self.lost + 0.5) / (self.packets + 1))
 
     def channel(self, link: AbstractRandomAffine) -> AbstractRandomAffine:
-        """Return the link behind an erasure."""
+        """Return the link behind an erasure, which lets each packet pass with the share of those that arrived."""
         return erasure(link, 1 - self.lost / self.packets)
 
 
@@ -160,15 +186,16 @@ class MarkovLosses(AbstractLossLaw):
 
     @property
     def order(self) -> int:
-        """Number of packets back on which the probability depends."""
+        """Number of packets back on which the probability depends: `counts` has 2^order rows."""
         return len(self.counts).bit_length() - 1
 
     def shares(self) -> dict[str, Share]:
-        """Return P(lost | arrived) as "fail" and P(arrived | lost) as "recover" with intervals, for order 1.
+        """Return the law's probabilities with 95 % intervals, by name.
 
-        For a higher order it is P(lost | past) of each past. `self.counts`: (arrived, lost) after each past, from which
-        Wilson's intervals come. `self.given_ends`: both shares with intervals by the likelihood, if stretches were cut
-        so that they end with an arrival, else None.
+        For order 1 they are "fail", P(lost | the last arrived), and "recover", P(arrived | the last was lost). For a
+        higher order it is "loss_after_PAST", P(lost | PAST), for each past: its digits are the last fates, 1 for a
+        loss, the latest one last. Intervals are Wilson's of the counts, or those of the likelihood if stretches were
+        cut where packets arrived (`given_ends`).
         """
         if self.given_ends is not None:
             return dict(zip(("fail", "recover"), self.given_ends, strict=True))
@@ -176,13 +203,13 @@ class MarkovLosses(AbstractLossLaw):
             (stayed, failed), (recovered, lost) = self.counts
             return {"fail": wilson(failed, stayed + failed), "recover": wilson(recovered, recovered + lost)}
         names = [f"loss_after_{past:0{self.order}b}" for past in range(len(self.counts))]
-        return {name: wilson(row[1], row.sum()) for name, row in zip(names, self.counts, strict=True)}
+        return {name: wilson(lost, arrived + lost) for name, (arrived, lost) in zip(names, self.counts, strict=True)}
 
     def predicted(self, fate: Packets) -> Packets:
-        """Return the probability (k + 1/2) / (n + 1) of each loss, if k of n packets with the same past were lost.
+        """Return the probability of each packet's loss, (k + 1/2) / (n + 1) if k of n packets with its past were lost.
 
-        The past is the last fates that are known without a gap, at most `order`, as a number whose bit 0 is the latest
-        fate (1: lost). `self.counts`: (arrived, lost) after each past.
+        The past of a packet are the last fates before it that are known without a gap, at most `order` of them. They
+        are written as a number whose bit 0 is the latest fate (1: lost).
         """
         past, length = _number_last_fates(fate, self.order)
         probabilities = np.zeros(len(fate))
@@ -191,25 +218,30 @@ class MarkovLosses(AbstractLossLaw):
             arrived, lost = self.counts.reshape(-1, 2**known, 2).sum(axis=0).T
             probability_after = (lost + 0.5) / (arrived + lost + 1)
             has_length = length == known
+            # `past` has only its `known` lowest bits; the mask keeps the index within 2^known.
             probabilities[has_length] = probability_after[past[has_length] & (2**known - 1)]
         return probabilities
 
     def _compute_return_probability(self, steps: int) -> float:
-        """Return P(arrived after this number of steps | arrived now), with the fates of the packets between unknown.
+        """Return P(a packet arrives | the packet `steps` before it arrived), if nothing is known of those between.
 
         For order 1 it is (b + a (1 - a - b)^steps) / (a + b) with a = P(lost | arrived) and b = P(arrived | lost).
         """
         if self.order > 1:
             return super()._compute_return_probability(steps)
-        arrived, lost = np.array([0.0, np.nan]), np.array([1.0, np.nan])  # one known fate, and the one to predict
-        a, b = self.predicted(arrived)[1], 1 - self.predicted(lost)[1]
+        # P(lost) of the second of two packets, whose first arrived or was lost.
+        (_, lost_after_arrival), (_, lost_after_loss) = (
+            self.predicted(np.array([fate, np.nan])) for fate in (0.0, 1.0)
+        )
+        a, b = lost_after_arrival, 1 - lost_after_loss
         return float((b + a * (1 - a - b) ** steps) / (a + b))
 
     def channel(self, link: AbstractRandomAffine) -> AbstractRandomAffine:
         """Return the link with these losses: a Markov chain whose modes are the fates of the last `order` packets.
 
-        A mode whose last packet was lost lets nothing pass (an `erasure` that arrives with probability 0). P(lost |
-        past) is the share of losses in `counts`, (arrived, lost) after each past, or 1/2 of a past never seen.
+        A mode whose last packet was lost lets nothing pass (an `erasure` that arrives with probability 0), any other
+        one is the link. P(lost | past) is the share of losses among the packets with this past, or 1/2 of a past that
+        was never seen.
         """
         arrives, lost = erasure(link, 1.0), erasure(link, 0.0)
         if self.order == 1:
@@ -227,7 +259,10 @@ class MarkovLosses(AbstractLossLaw):
 
 
 def _measure_spans(parts: Fates) -> np.ndarray:
-    """Return the steps from the first to the last packet of each stretch that was cut where packets arrived."""
+    """Return the steps from the first to the last packet of each stretch that was cut where packets arrived.
+
+    Such a stretch has CHOSEN as the fate of its ends. `parts`: all stretches, of which others are left out.
+    """
     return np.array([len(fate) - 1 for fate in parts if fate[-1] == CHOSEN and len(fate) > 1])
 
 
@@ -252,7 +287,13 @@ def _condition_on_ends(counts: np.ndarray, spans: np.ndarray, intervals: bool) -
     # gradient. Over this width a difference is wrong by 1e-8 of it, and its rounding is 1e-12.
     width = 1e-4
     shifts = width * np.eye(2)
-    hessian = np.stack([likelihood(top - shift)[1] - likelihood(top + shift)[1] for shift in shifts]) / (2 * width)
+
+    def gradient_at(x: np.ndarray) -> np.ndarray:
+        """Return the gradient of the log-likelihood at logits x (2,)."""
+        _, gradient = likelihood(x)
+        return gradient
+
+    hessian = np.stack([gradient_at(top - shift) - gradient_at(top + shift) for shift in shifts]) / (2 * width)
     variances = np.diag(np.linalg.pinv((hessian + hessian.T) / 2))
     # n of each probability, and the equivalent counts [[n (1 - fail), n fail], [n recover, n (1 - recover)]].
     fail, recover = shares = 1 / (1 + np.exp(-top))
@@ -286,8 +327,10 @@ class _LikelihoodBetweenEnds(NamedTuple):
         a, b = shares = 1 / (1 + np.exp(-x))
         # P_m = numerator / total. The derivative of power = (1 - a - b)^m by a, and by b, is `slope`.
         eigenvalue = 1 - a - b
-        power, slope = eigenvalue**self.spans, -self.spans * eigenvalue ** (self.spans - 1.0)
-        numerator, total = b + a * power, a + b
+        power = eigenvalue**self.spans
+        slope = -self.spans * eigenvalue ** (self.spans - 1.0)
+        numerator = b + a * power
+        total = a + b
         by_a = (power + a * slope) / numerator - 1 / total  # d log P_m / da
         by_b = (1 + a * slope) / numerator - 1 / total  # d log P_m / db
         (stayed, failed), (recovered, lost) = self.counts
@@ -298,9 +341,10 @@ class _LikelihoodBetweenEnds(NamedTuple):
 
 
 def _number_last_fates(fate: Packets, order: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the fates before each packet as a number, and how many of these are known without a gap, (packets,) each.
+    """Return the last fates before each packet as a binary number, and how many are known without a gap (packets,).
 
-    Bit 0 of the number is the latest fate, 1 for a loss. It has as many bits as are known, at most `order`.
+    Bit 0 of the number is the fate of the packet just before, 1 for a loss; bit 1 that of the one before it. The number
+    has as many bits as fates are known, at most `order`.
     """
     number = np.zeros(len(fate), dtype=int)
     length = np.zeros(len(fate), dtype=int)  # how many of the last fates are known

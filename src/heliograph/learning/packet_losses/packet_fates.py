@@ -19,11 +19,11 @@ class CheckedFates(Fates):
     """Stretches as `check_fates` gives them, with CHOSEN for ends that are no trials: they are not checked again."""
 
 
-JUMP = 200  # sequence numbers that leap so far ahead mean a restart, not of as many losses
+LEAST_JUMP = 200  # sequence numbers that leap so far ahead mean a restart, not of as many losses
 CHOSEN = 2.0  # of a packet that arrived, and is an end of its stretch for that reason
-COPY = 50  # a number received again may be a copy within so many
-FEW = 2  # numbers in a row that come again: more are those of a sender that restarted
-MOST = 2.0**53  # whole numbers up to here are doubles
+COPIES_WITHIN = 50  # a number received again may be a copy within so many
+FEW_COPIES = 2  # numbers in a row that come again: more are those of a sender that restarted
+LARGEST_NUMBER = 2.0**53  # whole numbers up to here are doubles
 
 
 class BetweenArrivals(np.ndarray):
@@ -47,22 +47,25 @@ class BetweenArrivals(np.ndarray):
 
 
 def find_trials(fate: np.ndarray) -> Bool[np.ndarray, " packets"]:
-    """Return which packets are trials: those whose fate is known, and that are no ends chosen for having arrived."""
+    """Return which packets say something of losses: those with a known fate, 0 (arrived) or 1 (lost).
+
+    The end of a stretch that was chosen because it arrived (CHOSEN) could not have been lost, and is no trial.
+    """
     return np.asarray((fate == 0) | (fate == 1))
 
 
 def fill_ends(fate: np.ndarray) -> Float[np.ndarray, " packets"]:
-    """Return the fates with 0, arrived, for chosen ends: so packets after them know them."""
+    """Return the fates with 0 (arrived) for chosen ends (CHOSEN), so that the packets after these see an arrival."""
     return np.where(fate == CHOSEN, 0.0, fate)
 
 
 def keep_ends_only(fate: np.ndarray) -> Float[np.ndarray, " packets"]:
-    """Return the stretch with NaN, unknown, for all packets but the chosen ends, which arrived."""
+    """Return the stretch with 0 (arrived) at its chosen ends, and NaN (unknown) for all packets between them."""
     return np.where(fate == CHOSEN, 0.0, np.nan)
 
 
 def fates_of_sequence(
-    sequence: "Float[ArrayLike, ' packets']", sent: "Float[ArrayLike, ' packets'] | None" = None, jump: int = JUMP
+    sequence: "Float[ArrayLike, ' packets']", sent: "Float[ArrayLike, ' packets'] | None" = None, jump: int = LEAST_JUMP
 ) -> Fates:
     """Return fates of the packets of one sender from the sequence numbers that were received: what is missing was lost.
 
@@ -89,7 +92,7 @@ def fates_of_sequence(
     numbers = array("sequence numbers", sequence, (None,))
     if not len(numbers) or np.any(numbers != np.round(numbers)):
         raise fail("sequence numbers", "whole numbers, at least one", "none" if not len(numbers) else "fractions")
-    if np.max(np.abs(numbers)) > MOST:
+    if np.max(np.abs(numbers)) > LARGEST_NUMBER:
         raise fail("sequence numbers", "numbers up to 2^53", f"{numbers[np.argmax(np.abs(numbers))]:g}")
     # In the order of sending where it is known: by time, then by number; equal pairs are copies, of which one stays.
     ordered = numbers.astype(np.int64)
@@ -108,7 +111,7 @@ def _split_at_restarts(received: np.ndarray, jump: int, may_be_copies: bool) -> 
         jump: a leap ahead by this much or more means a restart.
         may_be_copies: True if repeated numbers may be copies, which are dropped, and no restart.
     """
-    stretches: list[list[int]] = [[]]
+    stretches: list[list[int]] = [[]]  # the last one grows
     for run in _split_rising(received):
         # Numbers at the beginning of a rising run that are not above the last number of the stretch.
         repeated = [number for number in run if stretches[-1] and number <= stretches[-1][-1]]
@@ -129,18 +132,20 @@ def _split_rising(received: np.ndarray) -> list[list[int]]:
 
 
 def _are_copies(again: list[int], run: list[int], stretch: list[int]) -> bool:
-    """Return whether repeated numbers at the beginning of a rising run are copies, rather than from a restarted sender.
+    """Return whether repeated numbers at the beginning of a rising run are copies of packets received before.
 
-    Example: after 5, 6, 7, 8 come 7, 8, 9. Then `stretch` is [5, 6, 7, 8], `run` is [7, 8, 9] and `again` is [7, 8].
-    All must be among the last COPY numbers. At most FEW are always copies. More are copies if everything from some
-    number on comes again and the run then goes on, as from a broker that missed the acknowledgements. This number may
-    not be the first of the stretch.
+    Else they are new packets of a sender that restarted its count. Example: after 5, 6, 7, 8 come 7, 8, 9. Then
+    `stretch` is [5, 6, 7, 8], `run` is [7, 8, 9] and `again` is [7, 8]. All must be among the last COPIES_WITHIN
+    numbers. At most FEW_COPIES are always copies. More are copies if everything from some number on comes again and the
+    run then goes on, as from a broker that missed the acknowledgements. This number may not be the first of the
+    stretch.
     """
-    lately = stretch[-COPY:]
+    lately = stretch[-COPIES_WITHIN:]
     if not set(again) <= set(lately):
         return False
-    replayed = len(run) > len(again) and again[0] != stretch[0] and stretch[-len(again) :] == again
-    return len(again) <= FEW or replayed
+    goes_on = len(run) > len(again)
+    is_end_of_stretch = again[0] != stretch[0] and stretch[-len(again) :] == again
+    return len(again) <= FEW_COPIES or (goes_on and is_end_of_stretch)
 
 
 def _mark_gaps(received: np.ndarray) -> BetweenArrivals:

@@ -12,7 +12,7 @@ from heliograph.numerics.confidence_intervals import Share as Share
 FALL = 1.920729  # of the log-likelihood to the ends of a 95 % interval: half the 95 % point of chi-square(1)
 # The same where the maximum is at 0 or 1, as of an event that never came in n trials: (1 - p)^n = 5 %, n p ~ log 20.
 FALL_AT_END = 2.995732
-END = 14.0  # logits beyond are 0 and 1: shares of 8e-7
+FURTHEST_LOGIT = 14.0  # logits beyond are 0 and 1: shares of 8e-7
 FIRST_STEP = 0.25  # of a logit, from the maximum towards an end of an interval
 LOGIT_ACCURACY = 1e-3  # of an end
 PROFILE_ACCURACY = 1e-9  # relative, of a log-likelihood on a profile
@@ -23,9 +23,15 @@ LogLikelihood = Callable[[np.ndarray], tuple[float, np.ndarray]]  # logits (p,) 
 def maximise_over_shares(
     function: LogLikelihood, starts: list[np.ndarray], precision: float = 1e-13
 ) -> tuple[np.ndarray, float]:
-    """Return the highest point of a function of logits (p,), within END, by climbs from several starts; and its value.
+    """Return the highest point of a function of logits (p,), and its value there, by searches from several starts.
 
-    precision: the relative change of the value at which a climb ends.
+    A logit is log(p / (1 - p)) of a share p. The search is bounded to logits between -FURTHEST_LOGIT and
+    FURTHEST_LOGIT.
+
+    Args:
+        function: returns the value and the gradient at logits (p,).
+        starts: points at which searches begin, (p,) each.
+        precision: relative change of the value at which a search ends.
     """
 
     def negative(x: np.ndarray) -> tuple[float, np.ndarray]:
@@ -33,8 +39,8 @@ def maximise_over_shares(
         value, gradient = function(x)
         return -value, -gradient
 
-    # Logits beyond END are shares of 0 and 1, as far as data tell.
-    bounds = [(-END, END)] * len(starts[0])
+    # Logits beyond FURTHEST_LOGIT are shares of 0 and 1, as far as data tell.
+    bounds = [(-FURTHEST_LOGIT, FURTHEST_LOGIT)] * len(starts[0])
     results = [
         minimize(negative, x, jac=True, bounds=bounds, options={"ftol": precision, "gtol": 1e-7}) for x in starts
     ]
@@ -43,11 +49,17 @@ def maximise_over_shares(
 
 
 def estimate_shares(function: LogLikelihood, top: np.ndarray, value: float, intervals: bool) -> list[Share]:
-    """Return the shares at the maximum `top` (logits) of a log-likelihood, which is `value` there.
+    """Return the shares (probabilities) at the maximum of a log-likelihood, with 95 % intervals by its profile.
 
     The profile of a share is the log-likelihood with this share held, maximised over the others. Its interval ends
     where the profile has fallen by FALL (1.92, for 95 %). The ends are NaN unless `intervals` is True. A share at 0 or
-    at 1 is itself one end of its interval; the other end is where the profile has fallen by FALL_AT_END.
+    at 1 is itself one end of its interval; the other end is where the profile has fallen by FALL_AT_END (3.00).
+
+    Args:
+        function: log-likelihood of the logits of the shares, with its gradient.
+        top: the logits at its maximum (p,).
+        value: the log-likelihood there.
+        intervals: whether to compute the intervals.
     """
     if not intervals:
         return [Share(float(p), float("nan"), float("nan")) for p in expit(top)]
@@ -55,13 +67,20 @@ def estimate_shares(function: LogLikelihood, top: np.ndarray, value: float, inte
 
 
 def _find_profile_interval(function: LogLikelihood, top: np.ndarray, value: float, i: int) -> Share:
-    """Return share i at the maximum `top` (logits), with the interval where its profile has fallen by less than FALL.
+    """Return share i at the maximum of a log-likelihood, with its 95 % interval.
 
-    `value`: the log-likelihood at the maximum. If the share is 0 or 1, the interval has one end, with the fall
-    FALL_AT_END. END: the largest logit of the search.
+    The interval is where the profile of the share has fallen by less than FALL. A share at 0 or 1 is one end of its
+    interval; at the other end the profile has fallen by FALL_AT_END.
+
+    Args:
+        function: log-likelihood of the logits of all shares, with its gradient.
+        top: the logits at its maximum (p,).
+        value: the log-likelihood there.
+        i: index of the share.
     """
     # A logit near the bounds of the search means a share of 0 or 1, as far as the data tell.
-    is_zero, is_one = top[i] < 4 - END, top[i] > END - 4
+    is_zero = top[i] < 4 - FURTHEST_LOGIT
+    is_one = top[i] > FURTHEST_LOGIT - 4
     level = value - (FALL_AT_END if is_zero or is_one else FALL)
     low = 0.0 if is_zero else _find_profile_crossing(function, top, level, i, side=-1)
     high = 1.0 if is_one else _find_profile_crossing(function, top, level, i, side=1)
@@ -76,7 +95,7 @@ def _find_profile_crossing(function: LogLikelihood, top: np.ndarray, level: floa
 
     The profile at a logit is the log-likelihood, largest over all other logits. The crossing is an end of a confidence
     interval of the share, a probability 1 / (1 + exp(-logit)). 0 or 1 is returned where the profile stays above the
-    level up to the end of the domain, -END or END, on that side.
+    level up to the end of the domain, -FURTHEST_LOGIT or FURTHEST_LOGIT, on that side.
 
     Args:
         function: log-likelihood of the logits and its gradient.
@@ -93,7 +112,7 @@ def _find_profile_crossing(function: LogLikelihood, top: np.ndarray, level: floa
         """Return how far the profile is above `level` when logit number i is held at `logit`.
 
         The profile is the log-likelihood `function`, maximised over the other logits. The search begins at
-        `start_of_others`, which is the last result above the level.
+        `start_of_others`, which is the last result above the level. `others` are the indices of the other logits.
         """
         nonlocal start_of_others
         function_of_others = _fix_logit(function, i, logit, others)
@@ -106,19 +125,31 @@ def _find_profile_crossing(function: LogLikelihood, top: np.ndarray, level: floa
     inside, step = float(top[i]), FIRST_STEP
     if height_above_level(inside) <= 0:
         return float(expit(inside))
-    if height_above_level(side * END) >= 0:
+    if height_above_level(side * FURTHEST_LOGIT) >= 0:
         return 0.0 if side < 0 else 1.0
     # A bracket by doubled steps from the maximum, then Brent's method.
-    while height_above_level(outside := float(np.clip(inside + side * step, -END, END))) > 0:
+    while height_above_level(outside := float(np.clip(inside + side * step, -FURTHEST_LOGIT, FURTHEST_LOGIT))) > 0:
         inside, step = outside, 2 * step
     return float(expit(brentq(height_above_level, inside, outside, xtol=LOGIT_ACCURACY)))
 
 
 def _fix_logit(function: LogLikelihood, i: int, fixed: float, others: np.ndarray) -> LogLikelihood:
-    """Return the log-likelihood as a function of the logits with indices `others`, with logit i held at `fixed`."""
+    """Return the log-likelihood as a function of the logits with indices `others`, with logit i held at `fixed`.
+
+    A profile is the maximum of this function: the log-likelihood, largest over the other logits.
+
+    Args:
+        function: log-likelihood of all logits (p,), with its gradient.
+        i: index of the logit that is held.
+        fixed: its value.
+        others: indices of the other logits (p - 1,).
+    """
 
     def function_of_others(free: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return the log-likelihood with logit i held and the others at `free`, and its gradient by the others."""
+        """Return the log-likelihood with logit i held and the others at `free`, and its gradient by the others.
+
+        `function` is the log-likelihood of all logits, and `fixed` the value of logit i.
+        """
         x = np.zeros(len(free) + 1)
         x[i], x[others] = fixed, free
         value, gradient = function(x)

@@ -12,7 +12,7 @@ from heliograph.planning.free_numbers.problem import Build, FreeNumberProblem, r
 from heliograph.planning.network_from_design import repeat_network
 from heliograph.planning.power_budget import PowerLimits, make_budget, make_power_limits, make_unlimited
 from heliograph.planning.sequential_quadratic_programming import (
-    ACTIVE,
+    ACTIVE_ROOM,
     DescentProblem,
     PowerAndErrorLimits,
     ScaledProgramme,
@@ -24,9 +24,13 @@ from heliograph.planning.sequential_quadratic_programming import (
 class LagrangeConditions(NamedTuple):
     """Lagrange's conditions at a point: the value, what they leave of it, and a watt's worth.
 
-    residual: the part of the value by which a linear model still sees it fall within the limits, over a step of the
-    numbers' own size. worth: the error that one more watt takes away at each step of each transmitter, where its own
-    limits rise too; price: that of a watt more of the total, or of one transmitter where no total limits.
+    Args:
+        value: what is minimised, the error, or the mean power where an error is the target.
+        residual: the part of the value by which a linear model still sees it fall within the limits, over a step of the
+            numbers' own size; 0 at a minimum.
+        worth: the error that one more watt takes away at each step of each transmitter, where its own limits rise too
+            (time, hops).
+        price: that of a watt more of the total, or of one transmitter where no total limits.
     """
 
     value: float
@@ -73,7 +77,8 @@ def design_numbers(task: DesignProblem, build: Build) -> PowerDesign:
     # target what was minimised is the power, else the error.
     has_total = bool(np.isfinite(allowed.total))
     found, conditions = problem.solve_at(best), evaluate_lagrange_conditions(descent, limits, best, has_total)
-    network, error = problem.network(best), problem.criterion.compute_exact_error(found.covariances)
+    network = problem.network(best)
+    error = problem.criterion.compute_exact_error(found.covariances)
     value, unit = (error, "error") if target is None else (conditions.value, "power")
     certificate = Certificate(
         convex=False, value=value, bound=float("-inf"), stationarity=conditions.residual, starts=starts, unit=unit
@@ -93,12 +98,18 @@ def design_numbers(task: DesignProblem, build: Build) -> PowerDesign:
 
 
 def _limit_all_powers(problem: FreeNumberProblem, budget: object) -> PowerLimits:
-    """Return the limits that a budget sets to the powers of all transmitters (steps, hops), or none without budget."""
+    """Return the limits that a budget sets to the powers of all transmitters (steps, hops), or none without budget.
+
+    Args:
+        problem: the network as a function of free numbers; names its transmitters.
+        budget: the budget, a number for the total power, or None.
+    """
     steps, hops = problem.error.steps, len(problem.names)
     if budget is None:
         return make_unlimited(steps, hops)
     # All hops may change their powers, and none sends a fixed one.
-    all_are_free, no_fixed_powers = np.ones(hops, dtype=bool), np.zeros((steps, hops))
+    all_are_free = np.ones(hops, dtype=bool)
+    no_fixed_powers = np.zeros((steps, hops))
     limits = make_power_limits(make_budget(budget), problem.names, all_are_free, no_fixed_powers)
     if min(np.min(limits.peak, initial=np.inf), np.min(limits.mean, initial=np.inf), limits.total) <= 0:
         raise fail("budget", "limits above zero where numbers are free", "zero")
@@ -110,6 +121,10 @@ def _make_limit_rows(allowed: PowerLimits, target: float | None) -> PowerAndErro
 
     Peaks are limits like others here, since powers are not the free numbers. A row of a peak is one power divided by
     its peak, so that its limit is 1.
+
+    Args:
+        allowed: limits of the powers, infinite where there is none.
+        target: the target error, or None.
     """
     rows, most = allowed.make_limit_rows()
     peaks = allowed.peak.ravel()
@@ -127,8 +142,13 @@ def _make_limit_rows(allowed: PowerLimits, target: float | None) -> PowerAndErro
 def _make_unmet_limits_error(problem: DescentProblem, limits: PowerAndErrorLimits, begin: list[Vector]) -> ValueError:
     """Return the error for limits that no start meets: it names the least error within them, or the least power.
 
-    `begin`: the starts that were tried. A programme's `size` is the minimised number at its start, here at the best
+    A programme's `size` is the minimised number at its start, here at the best
     point that a search found.
+
+    Args:
+        problem: the function of the free numbers that is minimised.
+        limits: the limits that no start meets.
+        begin: the starts that were tried.
     """
     starts, sharpest = len(begin), problem.sharpnesses[-1]
     # If the limits of power can be met, the target error cannot: find the least error within them.
@@ -150,12 +170,39 @@ def _make_unmet_limits_error(problem: DescentProblem, limits: PowerAndErrorLimit
     return fail("budget", expected, "none that is")
 
 
+def _find_multipliers(programme: ScaledProgramme, problem: DescentProblem, x: Vector) -> tuple[Vector, float]:
+    """Return the multipliers m >= 0 of the limits (limits,), 0 where one is not reached, and |gradient - normals' m|.
+
+    The normals are those of the limits that are reached, of powers (the target error last) and of the ends of the
+    numbers' ranges. At a minimum they make up the whole gradient, and nothing is left of it.
+
+    Args:
+        programme: the objective and the limits, as functions of z = x / unit.
+        problem: the ranges and units of the numbers.
+        x: values of the free numbers.
+    """
+    z = x / problem.unit
+    gradient = programme.objective(z).slope
+    reached = programme.limit_room(z) < ACTIVE_ROOM
+    axes = np.eye(len(z))
+    at_low = x <= problem.low + ACTIVE_ROOM * problem.unit
+    at_high = x >= problem.high - ACTIVE_ROOM * problem.unit
+    normals = [*programme.limit_room_slope(z)[reached], *axes[at_low], *-axes[at_high]]
+    multipliers = np.zeros(len(reached))
+    if not normals:
+        return multipliers, float(np.linalg.norm(gradient))
+    solution, residual = nnls(np.array(normals).T, gradient)  # least squares with m >= 0
+    multipliers[reached] = solution[: int(reached.sum())]
+    return multipliers, residual
+
+
 def evaluate_lagrange_conditions(
     problem: DescentProblem, limits: PowerAndErrorLimits, x: Vector, has_total: bool
 ) -> LagrangeConditions:
     """Return Lagrange's conditions at the point x: how far the gradient is from a sum of the reached limits' normals.
 
-    The multipliers m >= 0 minimise |gradient - normals' m|; in a minimum nothing of the gradient is left.
+    The multipliers m >= 0 minimise |gradient - normals' m|; in a minimum nothing of the gradient is left. They say what
+    a watt more is worth.
 
     Args:
         problem: the function of the free numbers that is minimised, their ranges and units.
@@ -164,17 +211,10 @@ def evaluate_lagrange_conditions(
         has_total: whether the last of the limits of powers is that of the total.
     """
     # The programme counts numbers in their units, z = x / unit, and values in that at x, `programme.size`.
-    programme, z = ScaledProgramme(problem, limits, problem.sharpnesses[-1], x), x / problem.unit
-    value, gradient = programme.objective(z)
-    # Normals of the limits that are reached: of powers (the target last) and of the ends of the numbers' ranges.
-    reached = programme.limit_room(z) < ACTIVE
-    axes = np.eye(len(z))
-    at_low, at_high = x <= problem.low + ACTIVE * problem.unit, x >= problem.high - ACTIVE * problem.unit
-    normals = [*programme.limit_room_slope(z)[reached], *axes[at_low], *-axes[at_high]]
-    multipliers, residual = np.zeros(len(reached)), float(np.linalg.norm(gradient))
-    if normals:
-        solution, residual = nnls(np.array(normals).T, gradient)  # least squares with m >= 0
-        multipliers[reached] = solution[: int(reached.sum())]
+    programme = ScaledProgramme(problem, limits, problem.sharpnesses[-1], x)
+    z = x / problem.unit
+    value = programme.objective(z).value
+    multipliers, residual = _find_multipliers(programme, problem, x)
     # The worth of a watt of each transmitter at each step, from the multipliers of the limits of power; of the total's
     # alone that of a watt more of the total. A watt at every step, sent at one step, is worth `steps` times as much.
     worths = limits.rows * multipliers[: len(limits.most), None] * programme.size  # (limits, time and hops)

@@ -22,9 +22,10 @@ from heliograph.numerics.check import fail
 from heliograph.numerics.types import Float
 from heliograph.planning.error_objective import Criterion
 
-PLAIN, POLICIES = 400, 40  # iterations: of the recursion until its gains stabilise, of gains after that
-NEAR = 1e-4  # relative change of the recursion from which gains are improved
-CONVERGED = 1e-14
+MOST_RECURSIONS = 400  # periods of the Riccati recursion, until its gains stabilise the error
+MOST_POLICIES = 40  # improvements of the gains after that
+NEARLY_STEADY = 1e-4  # relative change over a period at which the recursion has come near the steady state
+CONVERGED = 1e-14  # relative change of the steady state at which gains are the best but for rounding
 
 Parts = Float[np.ndarray, "time M n n"]
 
@@ -34,33 +35,53 @@ Numbers = Any  # NumPy's or JAX's, as what they are made of
 class ModeSystem(NamedTuple):
     """System of the best linear filter at each step, by mode where the receiver observes modes.
 
-    x+ = A x + w, Cov w = Q; T the chain into the step and pi its law; z = H x + n, Cov n = N by mode; the powers sent.
-    start: the covariance before the first step; None where the steps repeat for ever.
+    x+ = A x + w, Cov w = Q, is received as z = H x + n, Cov n = N, with H and N by mode.
+
+    Args:
+        transition: A of each step (time, n, n).
+        process: Q (time, n, n).
+        chain: T, [k, i, j] = P(mode j at step k | mode i at the step before) (time, M, M).
+        law: pi, the probability of each mode at each step (time, M).
+        output: H (time, M, m, n).
+        noise: N (time, M, m, m).
+        powers: what the transmitters send, for the limits of a design (time, hops).
+        start: error covariance before the first step (n, n); None where the steps repeat for ever.
     """
 
-    transition: Numbers  # (time, n, n)
-    process: Numbers  # (time, n, n)
-    chain: Numbers  # (time, M, M)
-    law: Numbers  # (time, M)
-    output: Numbers  # (time, M, m, n)
-    noise: Numbers  # (time, M, m, m)
-    powers: Numbers  # (time, hops)
-    start: Numbers  # (n, n)
+    transition: Numbers
+    process: Numbers
+    chain: Numbers
+    law: Numbers
+    output: Numbers
+    noise: Numbers
+    powers: Numbers
+    start: Numbers
 
 
 class ModeSolution(NamedTuple):
-    """Covariances X (parts, which sum to P over the modes), gains K and adjoint L of each step and mode."""
+    """Solution of the filter's error in each step and mode.
+
+    Args:
+        parts: X = E[e e' 1{mode}] of the error e after a step, which sum to its covariance P over the modes
+            (time, M, n, n).
+        gains: K, the best gains of the filter (time, M, n, m).
+        adjoint: L, the derivative of the criterion by X, through all later steps (time, M, n, n).
+    """
 
     parts: Parts
     gains: Float[np.ndarray, "time M n m"]
     adjoint: Parts
 
 
-def solve_riccati(m: ModeSystem, criterion: Criterion) -> ModeSolution:
-    """Return the covariances X under the best gains K, these gains, and the adjoint L of X, by step and mode.
+def solve_riccati(system: ModeSystem, criterion: Criterion) -> ModeSolution:
+    """Return the error's covariances X under the filter's best gains K, these gains, and the adjoint L of X.
 
-    If `m.start` is None, the periodic steady state is solved for. Otherwise the recursion runs from this covariance.
-    Rounding may make a covariance negative by the share NEAR of the largest entry.
+    If `system.start` is None, the periodic steady state is solved for. Otherwise the recursion runs from this
+    covariance. Rounding may make a covariance negative by the share NEARLY_STEADY of the largest entry.
+
+    Args:
+        system: the system of the filter at each step, by mode.
+        criterion: the number that a design makes small, of which L is the derivative.
 
     Raises:
         ValueError: an error that grows without limit.
@@ -69,91 +90,115 @@ def solve_riccati(m: ModeSystem, criterion: Criterion) -> ModeSolution:
     growth = fail("steady error", expected, "growth")
     try:
         with np.errstate(over="ignore", invalid="ignore"):
-            X, gains = _solve_periodic(m) if m.start is None else _run_riccati(m, m.start[None])
+            X, gains = _solve_periodic(system) if system.start is None else _run_riccati(system, system.start[None])
     except np.linalg.LinAlgError:  # raised for NaN, and for a growth of exactly 1
         raise growth from None
-    if not np.all(np.isfinite(X)) or np.linalg.eigvalsh(X).min() < -NEAR * np.abs(X).max():
+    if not np.all(np.isfinite(X)) or np.linalg.eigvalsh(X).min() < -NEARLY_STEADY * np.abs(X).max():
         raise growth
     covariances_of_all_modes = X.sum(axis=1)
     _, weights = criterion.smooth(covariances_of_all_modes)
-    return ModeSolution(X, gains, _close_loop(m, gains).adjoint(weights, m.start is None))
+    return ModeSolution(X, gains, _close_loop(system, gains).adjoint(weights, system.start is None))
 
 
-def _solve_periodic(m: ModeSystem) -> tuple[Parts, np.ndarray]:
+def _solve_periodic(system: ModeSystem) -> tuple[Parts, np.ndarray]:
     """Return X (steps, modes, n, n) and the best gains K (steps, modes, n, m) for steps that repeat for ever.
 
-    X_k,i = E[e e' 1{mode i}] is the covariance of the error e after step k in mode i, times the mode's probability.
+    X_k,i = E[e e' 1{mode i}] is the covariance of the filter's error e after step k in mode i, times the mode's
+    probability. The coupled Riccati recursion alone converges slowly. So it runs, period after period, until X changes
+    by no more than NEARLY_STEADY of its size. Policy iteration goes on from there, which needs few rounds: it solves
+    the linear equation of X under fixed gains, and takes the best gains for that X. `system`: the system of the filter
+    at each step of the period, by mode.
     """
-    # Iterate the Riccati recursion until its gains stabilise the error; X begins as pi Q, the plant's noise alone.
-    last = m.law[-1, :, None, None] * m.process[-1]
-    for _ in range(PLAIN):
-        parts, gains = _run_riccati(m, last)
+    # The recursion; X begins as pi Q, the plant's noise alone.
+    last = system.law[-1, :, None, None] * system.process[-1]
+    for _ in range(MOST_RECURSIONS):
+        parts, gains = _run_riccati(system, last)
         change = np.abs(parts[-1] - last).max()
         last = parts[-1]
-        if not change > NEAR * np.abs(last).max():
+        if not change > NEARLY_STEADY * np.abs(last).max():
             break
-    # Policy iteration: X of these gains by a linear equation around the period, then the best gains for X.
-    for _ in range(POLICIES):
-        previous, parts = parts, _close_loop(m, gains).steady()
+    # Policy iteration.
+    for _ in range(MOST_POLICIES):
+        previous = parts
+        parts = _close_loop(system, gains).steady()  # X under these gains
         if np.abs(parts - previous).max() <= CONVERGED * np.abs(parts).max():
             break
         # The gains of step k follow from X after the step before it (the period's last for k = 0).
-        gains = np.array([_update_riccati(m, k, parts[k - 1])[0] for k in range(len(parts))])
+        updates = [_update_riccati(system, k, parts[k - 1]) for k in range(len(parts))]
+        gains = np.array([best_gains for best_gains, _ in updates])
     return parts, gains
 
 
-def _run_riccati(m: ModeSystem, X: Float[np.ndarray, "_ n n"]) -> tuple[Parts, np.ndarray]:
+def _run_riccati(system: ModeSystem, X: Float[np.ndarray, "_ n n"]) -> tuple[Parts, np.ndarray]:
     """Return X after each step (steps, modes, n, n) and the best gains, by the coupled Riccati recursion.
 
     X of a mode is its covariance times its probability. The argument X is that before the first step, for each mode, or
     one for all modes together if their chain has no memory.
+
+    Args:
+        system: the system of the filter at each step, by mode.
+        X: X before the first step (modes, n, n), or summed over the modes (1, n, n).
     """
     covariances, gains = [], []
-    for k in range(len(m.law)):
-        gain, X = _update_riccati(m, k, X)
+    for k in range(len(system.law)):
+        gain, X = _update_riccati(system, k, X)
         covariances.append(X)
         gains.append(gain)
     return np.array(covariances), np.array(gains)
 
 
-def _update_riccati(m: ModeSystem, k: int, X: Float[np.ndarray, "_ n n"]) -> tuple[np.ndarray, np.ndarray]:
+def _update_riccati(system: ModeSystem, k: int, X: Float[np.ndarray, "_ n n"]) -> tuple[np.ndarray, np.ndarray]:
     """Return the best gains K (modes, n, m) of step k and X (modes, n, n) after it, from X before it.
 
-    X of a mode is its covariance times the mode's probability (`m.law`), so the noises are weighted by it too.
+    X of a mode is its covariance times the mode's probability (`system.law`), so the noises are weighted by it too.
+
+    Args:
+        system: the system of the filter at each step, by mode.
+        k: the step.
+        X: X before the step (modes, n, n), or summed over the modes (1, n, n).
     """
-    law = m.law[k][:, None, None]
-    predicted_X = JumpSystem(m.chain[k], m.transition[k], law * m.process[k]).step(X)
+    law = system.law[k][:, None, None]
+    predicted_X = JumpSystem(system.chain[k], system.transition[k], law * system.process[k]).step(X)
     # A mode that never occurs has X = 0. Give it any regular noise, so that its gain is zero.
-    noise = np.where(law > 0, law * m.noise[k], np.eye(m.noise.shape[-1]))
-    corrected_X = observe_root(roots_of(predicted_X), m.output[k], roots_of(noise))
+    noise = np.where(law > 0, law * system.noise[k], np.eye(system.noise.shape[-1]))
+    corrected_X = observe_root(roots_of(predicted_X), system.output[k], roots_of(noise))
     return corrected_X.gain, corrected_X.covariance
 
 
-def _close_loop(m: ModeSystem, gains: Numbers) -> JumpSystem:
+def _close_loop(system: ModeSystem, gains: Numbers) -> JumpSystem:
     """Return the recursion of X under given gains K, X_j = sum_i T_ij F_j X_i F_j' + S_j, with T the chain of modes.
 
     X_j = E[e e' 1{mode j}] is the covariance of the error e times the probability of mode j. F = (I - K H) A and
-    S = pi [(I - K H) Q (I - K H)' + K N K'], with pi (`m.law`) the probability of each mode, H (`m.output`), and Q and
-    N the covariances of process and measurement noise. All are by step; K, H, N, F and S also by mode.
+    S = pi [(I - K H) Q (I - K H)' + K N K'], with pi (`system.law`) the probability of each mode, H (`system.output`),
+    and Q and N the covariances of process and measurement noise. All are by step; K, H, N, F and S also by mode.
+
+    Args:
+        system: the system of the filter at each step, by mode.
+        gains: K (steps, modes, n, m).
     """
-    K, law = gains, m.law[:, :, None, None]  # K (steps, modes, n, m); law: pi (steps, modes, 1, 1)
-    I_KH = np.eye(K.shape[2]) - K @ m.output  # I - K H
+    K = gains
+    law = system.law[:, :, None, None]  # K (steps, modes, n, m); law: pi (steps, modes, 1, 1)
+    I_KH = np.eye(K.shape[2]) - K @ system.output  # I - K H
     # `[:, None]`: A and Q of a step are the same in all modes.
-    noise_in_error = I_KH @ m.process[:, None] @ I_KH.swapaxes(-1, -2) + K @ m.noise @ K.swapaxes(-1, -2)
-    return JumpSystem(m.chain, I_KH @ m.transition[:, None], law * noise_in_error)
+    noise_in_error = I_KH @ system.process[:, None] @ I_KH.swapaxes(-1, -2) + K @ system.noise @ K.swapaxes(-1, -2)
+    return JumpSystem(system.chain, I_KH @ system.transition[:, None], law * noise_in_error)
 
 
-def lagrangian(m: ModeSystem, solution: ModeSolution) -> jax.Array:
-    """Return sum_k,j trace(L_k,j R_k,j), whose gradient by the system m at fixed X, K and L is that of the error.
+def lagrangian(system: ModeSystem, solution: ModeSolution) -> jax.Array:
+    """Return sum_k,j trace(L_k,j R_k,j), whose gradient by the system at fixed X, K and L is that of the error.
 
     X_k,j is the error covariance after step k in mode j, times the mode's probability. R_k,j is the right side of its
     recursion X_k,j = R_k,j(X_k-1) under the gains K. L is the adjoint: the derivative of the error by each X.
+
+    Args:
+        system: the system of the filter at each step, by mode; JAX differentiates by its arrays.
+        solution: X, K and L, which are held fixed.
     """
     X, gains, adjoint = (jnp.asarray(values) for values in solution)
     X_before = jnp.roll(X, 1, axis=0)  # in a period, the last step leads to the first
-    if m.start is not None:
+    if system.start is not None:
         # Over a horizon the first step's mode does not depend on an earlier one: all rows of its chain are equal. So
         # the covariance before it may be put into any mode, here mode 0.
-        X_before = jnp.zeros_like(X).at[0, 0].set(m.start).at[1:].set(X[:-1])
-    right_side = _close_loop(m, gains).step(X_before)
+        X_before = jnp.zeros_like(X).at[0, 0].set(system.start).at[1:].set(X[:-1])
+    right_side = _close_loop(system, gains).step(X_before)
     return jnp.sum(adjoint * right_side)

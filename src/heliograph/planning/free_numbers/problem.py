@@ -79,7 +79,10 @@ class FreeNumbers(NamedTuple):
         return np.concatenate([number.high.ravel() for number in self.by_name.values()])
 
     def split_by_name(self, x: Array) -> dict[str, Any]:
-        """Return {name: number in its shape} from the vector x of all free numbers, which stand one after another."""
+        """Return {name: number in its shape} from the vector x of all free numbers, which stand one after another.
+
+        JAX may trace x.
+        """
         by_name, begin = {}, 0
         for name, number in self.by_name.items():
             by_name[name] = x[begin : begin + number.start.size].reshape(number.start.shape)
@@ -87,10 +90,10 @@ class FreeNumbers(NamedTuple):
         return by_name
 
     def draw_start(self, draws: np.random.Generator) -> Vector:
-        """Return a random start: between the ends of each number's range, or near its first start without both ends.
+        """Return a random start (numbers,) for a further descent.
 
-        `self.low`, `self.high`: the ends of the ranges, infinite if there is none. Without both ends a number is its
-        first start times a random factor.
+        A number whose range has two ends is drawn between them. Another one is its first start times a random factor,
+        cut to the end that it has.
         """
         has_two_ends = np.isfinite(self.low) & np.isfinite(self.high)
         between_ends = draws.uniform(np.where(has_two_ends, self.low, 0.0), np.where(has_two_ends, self.high, 1.0))
@@ -123,7 +126,7 @@ def make_free_numbers(free: object) -> FreeNumbers:
 
 
 def _read_range_end(name: str, end: object, shape: tuple[int, ...]) -> np.ndarray:
-    """Return the lower or upper end of a number's range, broadcast to the start's shape; it may be infinite."""
+    """Return an end of the range of the number `name`, broadcast to its start's `shape`; it may be infinite."""
     try:
         value = np.broadcast_to(np.asarray(end, dtype=float), shape)
     except (TypeError, ValueError):
@@ -171,7 +174,7 @@ INSIDE = 1e-9  # of the way from an end to the start
 
 
 class ErrorAndPowerSlopes(NamedTuple):
-    """Derivatives of the error, and of what each transmitter sends at each step."""
+    """Derivatives by the free numbers x: of the error, and of what each transmitter sends at each step."""
 
     error: Float[np.ndarray, "x"]
     powers: Float[np.ndarray, "time hops x"]
@@ -200,6 +203,7 @@ class TracedNetwork:
         return are_same(mine, theirs)
 
     def __hash__(self) -> int:
+        """Return the hash of the arrays' shapes, in which equal networks agree."""
         return hash(self._list_array_shapes())
 
     def _list_array_shapes(self) -> tuple[object, ...]:
@@ -214,8 +218,12 @@ class TracedNetwork:
     def make_system(self, x: Array) -> ModeSystem:
         """Return the system of the best linear filter if the free numbers have the values x (numbers,).
 
-        `self.young`: True if the scalar of Young's inequality is one of the numbers; it is not passed to the network.
-        UNTRACEABLE: errors of JAX if a function needs the value of a traced number.
+        JAX traces x to differentiate. A function that needs the value of a number (UNTRACEABLE) is refused. If a scalar
+        of Young's inequality is one of the numbers (`self.young`), it bounds the error, and is not passed to the
+        network.
+
+        Raises:
+            ValueError: a function that JAX cannot trace.
         """
         values = self.numbers.split_by_name(jnp.asarray(x))
         young = values.pop(YOUNG) if self.young else None
@@ -227,7 +235,11 @@ class TracedNetwork:
         return make_mode_system(network, self.error, young)
 
     def differentiate_by_numbers(self, x: Array, solution: ModeSolution) -> ErrorAndPowerSlopes:
-        """Return the derivatives of error and powers by the numbers x, with X, K and L of the solution held fixed."""
+        """Return the derivatives of error and powers by the free numbers x (numbers,).
+
+        The error's derivative is that of the Lagrangian with the solution's covariances X, gains K and adjoint L held
+        fixed. Derivatives by the system's arrays come first; JAX pulls all of them back to x at once.
+        """
         system, pull_back = jax.vjp(self.make_system, jnp.asarray(x))
         # Derivatives by the system's arrays, each in the form of a system: of the error, then of each single power.
         of_error, count = jax.grad(lagrangian)(system, solution), system.powers.size
@@ -265,7 +277,7 @@ class EvaluatedPoint(NamedTuple):
     @property
     def error(self) -> float:
         """Return the number that the search minimises: the error, or if it is an eigenvalue its smoothed form."""
-        return self.criterion.smooth(self.covariances)[0]
+        return self.criterion.smooth(self.covariances).value
 
     @property
     def powers(self) -> Float[np.ndarray, "time hops"]:
@@ -280,7 +292,7 @@ class FreeNumberProblem:
         """Build the network at the starts of its free numbers, and compile its programs.
 
         If a mean gain is uncertain, the scalar of Young's inequality, which bounds the error, becomes one more free
-        number, and `young` is True.
+        number, and `young` is True. `build` takes the free numbers as keyword arguments.
         """
         self.build, self.numbers, self.error, self.young = build, numbers, error, False
         network = self.network(numbers.start)
@@ -328,6 +340,10 @@ class FreeNumberProblem:
     def solve_at(self, x: Vector, criterion: Criterion | None = None) -> EvaluatedPoint:
         """Return system, solution and derivatives at x, for a criterion (that of the problem unless given).
 
+        Args:
+            x: values of all free numbers, as one vector.
+            criterion: the criterion, such as one that is smoothed more.
+
         Raises:
             ValueError: an error that grows without limit, powers that do.
         """
@@ -348,7 +364,9 @@ class FreeNumberProblem:
     def evaluate(self, x: Vector, sharpness: int | None) -> Evaluation | None:
         """Return the error, the powers and their derivatives, or None if error or powers grow without limit.
 
-        `sharpness`: q in tr(S^q)^(1/q), which stands for the largest eigenvalue; None for the trace.
+        Args:
+            x: values of all free numbers, as one vector.
+            sharpness: q in tr(S^q)^(1/q), which stands for the largest eigenvalue; None for the trace.
         """
         try:
             point = self.solve_at(x, self.criterion._replace(sharpness=sharpness))

@@ -52,10 +52,14 @@ class SensorAndChannel(NamedTuple):
 
 
 class NodeReception(NamedTuple):
-    """Reception of one node.
+    """Reception of one node with M observed modes: z = H x + noise of covariance N in each.
 
-    chain: [k, i, j] = P(mode j at step k | mode i at the step before). law: P(mode j) at step k. output, noise:
-    H = E[G] C and N by mode. powers: what the node's transmitters send.
+    Args:
+        chain: [k, i, j] = P(mode j at step k | mode i at the step before) (time, M, M).
+        law: probability of each mode at each step (time, M).
+        output: H = E[G] C, with the channel's gain G and the sensor's matrix C (time, M, m, n).
+        noise: N (time, M, m, m).
+        powers: what the node's transmitters send (time, hops).
     """
 
     chain: Float[Array, "time M M"]
@@ -74,10 +78,14 @@ class _StepsReception(NamedTuple):
 
 
 class _ObservedModes(NamedTuple):
-    """A channel by its observed modes.
+    """A channel by its modes that the receiver observes, such as arrived and lost.
 
-    onward: [i, j] = P(mode j at the next step | mode i). initial: law of the first mode. maps: the channel in each
-    mode. arrived: which outputs arrive in each. forgets: whether the next mode is independent of the mode.
+    Args:
+        onward: [i, j] = P(mode j at the next step | mode i) (M, M).
+        initial: law of the first mode (M,).
+        maps: the channel in each mode.
+        arrived: which outputs arrive in each mode.
+        forgets: whether the next mode is independent of the mode.
     """
 
     onward: Array
@@ -142,7 +150,8 @@ def make_mode_system(network: Network, error: Error, young: Array | None = None)
     Raises:
         ValueError: a channel with memory whose mode is not observed, more than MOST_MODES modes together.
     """
-    steps, forever = error.steps, error.horizon is None
+    steps = error.steps
+    forever = error.horizon is None
     plants = [at(network.plant, k) for k in range(steps)]
     a = jnp.stack([jnp.asarray(plant.matrix) for plant in plants])
     q = jnp.stack([jnp.asarray(plant.noise.covariance) for plant in plants])
@@ -246,7 +255,10 @@ def _find_laws_and_chain(
 
 
 def means_are_known(name: str, channel: AbstractRandomAffine) -> bool:
-    """Decide whether no uncertain probability moves a mean gain, so that no scalar of Young's is needed."""
+    """Return whether all mean gains of a channel are known; uncertain probabilities may leave them within bounds only.
+
+    If they are known, Young's inequality, and its scalar, is not needed to bound the error.
+    """
     return all(has_known_mean(second_order(mode_map)) for mode_map in _find_observed_modes(name, channel).maps)
 
 
@@ -279,20 +291,24 @@ def _find_observed_modes(name: str, channel: AbstractRandomAffine) -> _ObservedM
 
 
 def _make_flagged_modes(name: str, channel: AbstractRandomAffine) -> JointModes:
-    """Return the joint modes of a channel that delivers the modes of all its chains as flags beside its other outputs.
+    """Return the joint modes of a channel with memory whose receiver sees the mode of each of its Markov chains.
 
-    A flag is an output that is a chain's mode itself. A drifting gain has no modes.
+    The channel is a stack of maps side by side: some carry the signal, the others (`ModeOutput`, "flags") deliver the
+    mode of a chain as a number. A joint mode is one mode of each chain. The result has their chain, and the channel of
+    the signal in each joint mode, which then has no memory.
 
     Raises:
-        ValueError: a chain whose mode is not delivered, or a gain that drifts.
+        ValueError: a chain whose mode is not delivered, or a gain that drifts, which has no modes.
     """
     maps = channel.in_parallel
     maps_of_signal = [affine for affine in maps if not isinstance(affine, ModeOutput)]
-    flag_count, chains = len(maps) - len(maps_of_signal), memories(channel)
-    delivers_all_modes = flag_count == len(chains) and not any(memory.drifts for memory in chains.values())
+    flag_count = len(maps) - len(maps_of_signal)
+    chains = memories(channel).values()  # Markov chains, and gains that drift
+    delivers_all_modes = flag_count == len(chains) and not any(memory.drifts for memory in chains)
     if not maps_of_signal or not delivers_all_modes:
         raise fail(f"channel of {name!r}", "chains whose modes are observed (hg.model.with_flag)", "one with memory")
-    return joint_modes(maps_of_signal[0] if len(maps_of_signal) == 1 else Stack(maps_of_signal), order=2)
+    channel_of_signal = maps_of_signal[0] if len(maps_of_signal) == 1 else Stack(maps_of_signal)
+    return joint_modes(channel_of_signal, order=2)  # exact for second moments of its gains and noises
 
 
 def _propagate_laws(
@@ -322,9 +338,8 @@ def _compute_steps_reception(
 ) -> _StepsReception:
     """Return H (time, M, m, n), N (time, M, m, m) and powers (time, hops) over steps with one sensor and channel.
 
-    A planner finds the error for given powers of transmitters; the channel has M modes that the receiver observes, such
-    as arrived and lost. H is the mean map from state to what arrives in each mode, N the covariance of its noise, which
-    depends on the second moment of the state if gains are random.
+    The channel has M modes that the receiver observes, such as arrived and lost. H is the mean map from state to what
+    arrives in each mode, N the covariance of its noise, which depends on the state's second moment for random gains.
 
     Args:
         sensor: the sensor, with m outputs.
@@ -364,6 +379,13 @@ def _compute_mode_reception(
     the sensor's noise and Spread = E[dG Y dG'] the noise that the random part dG of (gain, offset) makes, given
     Y = E (y, 1)(y, 1)' (`y`) at each step. If M is uncertain (`young`: a scalar b > 0 for each step), N =
     Spread + Shift / b + (1 + b) M R M', with Shift the bound of what the error of M makes. Lost outputs: H = 0, N = 1.
+
+    Args:
+        channel: the channel in this mode, without memory.
+        arrived: which outputs arrive in it (m,).
+        y: E (y, 1)(y, 1)' of what the sensor measures at each step (time, m1, m1).
+        sensor: the sensor.
+        young: b at each step (time,), or None.
     """
     moments, present = second_order(channel), jnp.asarray(arrived)
     gain = jnp.where(present[:, None], jnp.asarray(moments.mean_gain), 0.0)

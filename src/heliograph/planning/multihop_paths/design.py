@@ -4,16 +4,14 @@ import numpy as np
 
 from heliograph.numerics.check import fail
 from heliograph.planning.design_problem import Certificate, DesignProblem, PowerDesign
-from heliograph.planning.multihop_paths.model import (
-    compute_path_information,
-)
+from heliograph.planning.multihop_paths.model import compute_path_information
 from heliograph.planning.multihop_paths.path_problem import PathProblem, PowerTask
 from heliograph.planning.multihop_paths.power_split_over_hops import SplitPaths
 from heliograph.planning.multihop_paths.water_filling import water_filling
-from heliograph.planning.power_budget import MET, Powers
+from heliograph.planning.power_budget import MET_EXCESS, Powers
 
-UNLIMITED = 1e13  # times alpha: more changes nothing but rounding
-REACHED = 1e-9  # relative: a target so near to what unlimited power leaves is not reached
+PLENTY = 1e13  # times alpha: more changes nothing but rounding
+REACH_MARGIN = 1e-9  # relative: a target so near to what unlimited power leaves is not reached
 FACTORS = 1e-12, 1e12  # by which a start is raised until it reaches a target
 BISECTIONS = 60
 
@@ -31,8 +29,9 @@ def find_least_error_powers(task: PowerTask) -> tuple[Powers, Certificate]:
     powers = problem.solve_from_starts(starts)
     assert powers is not None  # the starts are within the limits
     # The least value of the error's tangent at these powers within the limits. A convex error is nowhere below it.
-    value, bound = problem.compute_exact_error(powers), problem.lower_bound(powers)
-    _, tangent_value, _ = problem.make_support(powers)
+    value = problem.compute_exact_error(powers)
+    bound = problem.lower_bound(powers)
+    tangent_value = problem.make_support(powers).value
     stationarity = max(tangent_value - bound, 0.0) / value if value > 0 else 0.0  # 0: nothing is left to gain
     # An error that is not convex is bounded by the convex problem with concave envelopes of each path's information.
     if not task.convex:
@@ -62,15 +61,17 @@ def find_least_total_powers(task: PowerTask, target: float) -> tuple[Powers, Cer
     if powers is None:
         raise fail("target error", "one that some start reaches (give more starts)", f"{target:.6g}")
     total = float(powers.mean(axis=0).sum())
-    if total > limits.total * (1 + MET):
-        least = find_least_error_powers(task)[1].value
+    if total > limits.total * (1 + MET_EXCESS):
+        _, certificate = find_least_error_powers(task)
+        least = certificate.value
         raise fail("target error", f"at least {least:.6g}, the least found within the budget", f"{target:.6g}")
     # The least total with which the error's tangent at these powers reaches the target. A convex error needs no less.
     bound = unlimited.problem.bound_least_total(powers, target)
     stationarity = 1 - bound / total if total > 0 else 0.0
     # An error that is not convex is bounded by the convex problem with concave envelopes of each path's information.
     if not task.convex:
-        relaxed, of_paths = unlimited.relax_to_whole_paths(), task.sum_by_path(powers)
+        relaxed = unlimited.relax_to_whole_paths()
+        of_paths = task.sum_by_path(powers)
         relaxed_powers = _find_least_powers(relaxed, [of_paths], target)
         bound = relaxed.bound_least_total(of_paths if relaxed_powers is None else relaxed_powers, target)
     fixed = float(task.fixed[:, ~task.free].mean(axis=0).sum())
@@ -87,10 +88,15 @@ def find_least_total_powers(task: PowerTask, target: float) -> tuple[Powers, Cer
 def _find_least_powers(problem: PathProblem, starts: list[Powers], target: float) -> Powers | None:
     """Return the powers of least total that reach a target, by descents from the starts, or None if none can.
 
-    Each start is raised until it reaches the target. `scale`: the size of powers, which sets the steps of the search.
+    Each start is raised until it reaches the target.
+
+    Args:
+        problem: the error as a function of the free powers.
+        starts: powers at which searches begin, (time, free) each.
+        target: the target error.
     """
     no_power = np.zeros_like(starts[0])
-    if problem.criterion.smooth(problem.covariances(no_power))[0] <= target:
+    if problem.criterion.smooth(problem.covariances(no_power)).value <= target:
         return no_power
     raised_starts = [_raise_powers(problem, start, target) for start in starts]
     reaching_starts = [start for start in raised_starts if start is not None]
@@ -101,31 +107,50 @@ def _find_least_powers(problem: PathProblem, starts: list[Powers], target: float
 
 
 def _raise_powers(problem: PathProblem, start: Powers, target: float) -> Powers | None:
-    """Return the start times the least factor that reaches the target within peaks and means, or None if none does."""
+    """Return the start times the least factor with which the error reaches the target, or None if none does.
+
+    The powers are cut to their limits. The factor is found by bisection of its logarithm between the two FACTORS, 1e-12
+    and 1e12, as the error falls with the powers.
+
+    Args:
+        problem: the error as a function of the free powers, with their limits.
+        start: powers that are raised or lowered (time, free).
+        target: the target error.
+    """
 
     def reaches(factor: float) -> bool:
-        """Return whether the start's powers times this factor, cut to the limits, lead to the target error or less."""
-        powers = problem.limits.clip_powers(start * factor)
-        return problem.criterion.smooth(problem.covariances(powers))[0] <= target
+        """Return whether the start's powers times this factor, cut to the limits, lead to the target error or less.
 
-    low, high = FACTORS  # the factor's logarithm is bisected between these
+        `problem` has the error as a function of the powers, and their limits.
+        """
+        powers = problem.limits.clip_powers(start * factor)
+        return problem.criterion.smooth(problem.covariances(powers)).value <= target
+
+    low, high = FACTORS
     if not reaches(high):
         return None
     for _ in range(BISECTIONS):
-        middle = np.sqrt(low * high)
+        middle = np.sqrt(low * high)  # halves the interval of logarithms
         low, high = (low, middle) if reaches(middle) else (middle, high)
     return problem.limits.clip_powers(start * high)
 
 
 def _check_reachable(task: PowerTask, target: float) -> None:
-    """Raise ValueError unless the target exceeds, by the share REACHED, the error that all allowed power leaves."""
-    limits, alpha = task.problem.limits, task.problem.paths.alpha[:, task.free]
+    """Raise ValueError unless the target exceeds, by the share REACH_MARGIN, the error that all allowed power leaves.
+
+    Args:
+        task: the error, the free hops and the limits of their powers.
+        target: the target error.
+    """
+    limits = task.problem.limits
+    alpha = task.problem.paths.alpha[:, task.free]
     has_limits = np.any(np.isfinite(limits.peak)) or np.any(np.isfinite(limits.mean))
-    # Each may send up to its peak, up to its mean power of all steps in one, and at most a lot of power (UNLIMITED).
-    plenty, whole_mean = UNLIMITED * np.maximum(alpha, 1.0), limits.mean * len(limits.peak)
+    # Each may send up to its peak, up to its mean power of all steps in one, and at most a lot of power (PLENTY).
+    plenty = PLENTY * np.maximum(alpha, 1.0)
+    whole_mean = limits.mean * len(limits.peak)
     largest_powers = np.minimum(np.minimum(limits.peak, plenty), whole_mean)
     least_error = task.problem.compute_exact_error(largest_powers)
-    if target <= least_error * (1 + REACHED):
+    if target <= least_error * (1 + REACH_MARGIN):
         what = "power at its limits" if has_limits else "unlimited power"
         raise fail("target error", f"more than {least_error:.6g}: {what} leaves {least_error:.6g}", f"{target:.6g}")
 
@@ -145,7 +170,7 @@ def design_paths(problem: DesignProblem, task: PowerTask, target: float | None, 
     of_all_hops[:, task.free] = powers
     # Derivatives (time, hop) by the powers of all hops, of those that are not free too.
     all_free = task.problem._replace(path=paths.path, information=lambda p: compute_path_information(paths, p))
-    _, _, gradient = all_free.sensitivity(of_all_hops)
+    gradient = all_free.sensitivity(of_all_hops).gradient
     return PowerDesign(
         problem=problem,
         powers=dict(zip(paths.names, of_all_hops.T, strict=True)),

@@ -33,7 +33,13 @@ Matrices = Float[np.ndarray, "time n n"]
 
 
 class PlantSteps(NamedTuple):
-    """A and Q of each step; `start` is the error covariance before the first, None where the steps repeat for ever."""
+    """Linear plant x+ = A x + w, Cov w = Q, at each step.
+
+    Args:
+        transition: A (time, n, n).
+        process: Q (time, n, n).
+        start: error covariance before the first step (n, n); None where the steps repeat for ever.
+    """
 
     transition: Matrices
     process: Matrices
@@ -49,7 +55,10 @@ class RiccatiMap(NamedTuple):
 
 
 def compose_steps(first: RiccatiMap, second: RiccatiMap) -> RiccatiMap:
-    """Return the map of two filter steps, `first` and then `second`, as one map X -> A X (I + G X)^-1 A' + H."""
+    """Return the map of two filter steps, `first` and then `second`, as one map X -> A X (I + G X)^-1 A' + H.
+
+    Maps of this form are closed under composition, so that one of many steps is found by doubling.
+    """
     inner = np.linalg.inv(np.eye(len(first.h)) + first.h @ second.g)
     through = inner @ first.a
     g = first.g + first.a.T @ second.g @ through
@@ -60,7 +69,7 @@ def compose_steps(first: RiccatiMap, second: RiccatiMap) -> RiccatiMap:
 def solve_fixed_point(step: RiccatiMap) -> Float[np.ndarray, "n n"]:
     """Return the limit X of X+ = A X (I + G X)^-1 A' + H from X = 0, by doubling: k doublings make 2^k steps.
 
-    It is reached when a doubling changes H by at most the share CONVERGED.
+    It is reached when a doubling changes H by at most the share CONVERGED. `step`: A, G and H.
 
     Raises:
         ValueError: covariances that grow without limit.
@@ -79,6 +88,10 @@ def solve_fixed_point(step: RiccatiMap) -> Float[np.ndarray, "n n"]:
 def compute_covariances(plants: PlantSteps, information: Matrices) -> Matrices:
     """Return the posterior covariance P_k of each step (time, n, n) under the information J_k received at each step.
 
+    Args:
+        plants: A and Q of each step, and the covariance before the first, if any.
+        information: J_k (time, n, n).
+
     Raises:
         ValueError: steps that repeat for ever, under which the error grows without limit.
     """
@@ -91,7 +104,9 @@ def compute_covariances(plants: PlantSteps, information: Matrices) -> Matrices:
     else:
         predicted = a[0] @ plants.start @ a[0].T + q[0]
     # The recursion through the steps, on roots.
-    root, process, posteriors = roots_of(predicted), roots_of(q), list[np.ndarray]()
+    root = roots_of(predicted)
+    process = roots_of(q)
+    posteriors = list[np.ndarray]()
     for k, received in enumerate(information):
         if k:  # the first step is predicted already
             root = np.concatenate([a[k] @ root, process[k]], axis=1)
@@ -103,11 +118,16 @@ def compute_covariances(plants: PlantSteps, information: Matrices) -> Matrices:
 def compute_adjoint(plants: PlantSteps, information: Matrices, p: Matrices, weights: Matrices) -> Matrices:
     """Return the adjoint L_k (time, n, n): the gradient of the cost by P_k, through P_k itself and all later steps.
 
-    `information`: J_k. `p`: P_k. `weights`: the derivative W_k of the cost by P_k alone. All are (time, n, n).
+    Args:
+        plants: A and Q of each step.
+        information: J_k, the information received at each step (time, n, n).
+        p: P_k, the error covariance after each step (time, n, n).
+        weights: W_k, the derivative of the cost by P_k alone (time, n, n).
     """
     # From step to step the filter's error is multiplied by phi, and its covariance moves by X+ = phi X phi'.
     phi = (np.eye(p.shape[-1]) - p @ information) @ plants.transition
-    one_mode_always, no_noise = np.ones((len(p), 1, 1)), np.zeros_like(phi[:, None])
+    one_mode_always = np.ones((len(p), 1, 1))
+    no_noise = np.zeros_like(phi[:, None])
     system = JumpSystem(one_mode_always, phi[:, None], no_noise)
     return system.adjoint(weights, plants.start is None)[:, 0]
 
@@ -121,10 +141,19 @@ ByHop = TypeAliasType("ByHop", Float[ArrayLike, "..."])  # (M, H); (M,) of one h
 
 @readable
 class Paths(NamedTuple):
-    """Linear plant measured over independent paths; every array has a leading time axis, a period or a horizon.
+    """Linear plant measured over independent paths, each of which carries y = c x + v over a chain of hops.
 
-    plants: A and Q of each step. rows: c of each path. second: s = E y^2; signal: t = s - Var v. path: number of the
-    path of each hop, in the order of the hops. kappa, alpha: of each hop. names: of the hops' transmitters.
+    Arrays have a leading axis of the steps of a period or a horizon.
+
+    Args:
+        plants: A and Q of each step.
+        rows: c of each path (time, path, n).
+        second: s = E y^2 of each path (time, path).
+        signal: t = s - Var v (time, path).
+        path: number of the path of each hop, in the order of the hops (hop,).
+        kappa: E g^2 / (E g)^2 of each hop's random gain g (time, hop).
+        alpha: noise variance over E g^2 of each hop (time, hop).
+        names: names of the hops' transmitters.
     """
 
     plants: PlantSteps
@@ -183,11 +212,13 @@ def independent_paths(
     steps = error.steps
     a = array("transition of paths", transition, ("states", "states"))
     n = len(a)
-    a, q = array("transition of paths", a, (n, n)), covariance("process noise of paths", process, n)
+    a = array("transition of paths", a, (n, n))
+    q = covariance("process noise of paths", process, n)
     c = array("rows of paths", rows, (None, n))
     r = require_at_least(0.0, "noises of paths", array("noises of paths", noises, (len(c),)))
     # kappa and alpha of all hops (sensors, hops of each); one of alpha without a second axis.
-    sensors, hops_each = len(c), 1 if rank("alpha of paths", alpha) < 2 else np.shape(alpha)[1]
+    sensors = len(c)
+    hops_each = 1 if rank("alpha of paths", alpha) < 2 else np.shape(alpha)[1]
     hop_kappa = _read_hop_numbers("kappa of paths", kappa, (sensors, hops_each), least=1.0)
     hop_alpha = _read_hop_numbers("alpha of paths", alpha, (sensors, hops_each), least=0.0)
     mean = array("initial mean of paths", np.zeros(n) if initial_mean is None else initial_mean, (n,))
@@ -240,7 +271,8 @@ def _read_hop_numbers(
 
 def compute_path_kappas(paths: Paths) -> PathValues:
     """Return K (time, path), the product of kappa = E g^2 / (E g)^2 of the hops along each path."""
-    return np.asarray(_arrange_by_position(paths, paths.kappa)[0].prod(axis=-1))
+    kappas, _ = _arrange_by_position(paths, paths.kappa)  # (time, path, position along the path)
+    return np.asarray(kappas.prod(axis=-1))
 
 
 def _arrange_by_position(
@@ -249,6 +281,10 @@ def _arrange_by_position(
     """Return the values of hops as (time, path, position along the path), and the position of each hop on its path.
 
     Where a path is shorter than the longest, the value is 1.
+
+    Args:
+        paths: the paths, each a chain of hops.
+        values: a number of each hop at each step (time, hop).
     """
     order = np.argsort(paths.path, kind="stable")
     hop_counts = np.bincount(paths.path, minlength=paths.second.shape[1])
@@ -261,7 +297,12 @@ def _arrange_by_position(
 
 
 def share_of_signal(powers: Powers, alpha: Powers) -> Powers:
-    """Return the share of signal p / (p + alpha) in what each hop delivers (time, hop), with alpha in sent power."""
+    """Return the share of signal p / (p + alpha) in what each hop delivers (time, hop), with alpha in sent power.
+
+    Args:
+        powers: what each hop sends, p (time, hop).
+        alpha: noise of each hop in units of sent power (time, hop).
+    """
     total = powers + alpha
     # A hop without noise and power has the share 1: without noise any power will do.
     return np.asarray(np.divide(powers, total, out=np.ones_like(powers), where=total > 0))
@@ -276,7 +317,8 @@ def compute_path_information(paths: Paths, powers: Powers) -> PathInformation:
     """
     shares = share_of_signal(powers, paths.alpha)
     factors, positions = _arrange_by_position(paths, shares)  # factors (time, path, position)
-    F, sK = factors.prod(axis=-1), paths.second * compute_path_kappas(paths)
+    F = factors.prod(axis=-1)
+    sK = paths.second * compute_path_kappas(paths)
     denominator = sK - paths.signal * F
     # dF/dp_h is the product of the other hops' factors times alpha / (p + alpha)^2.
     products_of_others = [np.delete(factors, k, axis=-1).prod(axis=-1) for k in range(factors.shape[-1])]
@@ -311,6 +353,6 @@ def compute_path_sensitivities(
         p: the error covariance P after each step.
         weights: the derivative of the cost by each step's P.
     """
-    ahead = compute_adjoint(paths.plants, compute_information_matrix(paths, information), p, weights)
-    projected = paths.rows @ p
-    return np.asarray(np.sum((projected @ ahead) * projected, axis=-1))
+    L = compute_adjoint(paths.plants, compute_information_matrix(paths, information), p, weights)
+    c_P = paths.rows @ p  # row i: c_i P (time, path, n)
+    return np.asarray(np.sum((c_P @ L) * c_P, axis=-1))

@@ -31,8 +31,10 @@ UNCORRELATED = 1e-12  # relative: a covariance of noises that counts as none
 class HopChain(NamedTuple):
     """A chain of hops for one number: what it carries, and kappa and alpha of its hops.
 
-    row: the number is row @ (y, 1), with the sensor's outputs y. hops: {name: (kappa, alpha)} in the order of the
-    chain.
+    Args:
+        row: the number is row @ (y, 1), with the sensor's outputs y (m + 1,).
+        hops: {name: (kappa, alpha)} in the order of the chain, with kappa = E g^2 / (E g)^2 of a hop's gain g, and
+            alpha its noise variance over E g^2.
     """
 
     row: Float[np.ndarray, "m1"]
@@ -58,7 +60,8 @@ def paths_of(network: Network, error: Error) -> tuple[Paths, Float[np.ndarray, "
     """
     # Check that the plant is linear and every node a plain one, of a linear sensor behind hops.
     instance("network", network, Network, "a Network")
-    plant, steps = network.plant, instance("error", error, Error, "an Error").steps
+    plant = network.plant
+    steps = instance("error", error, Error, "an Error").steps
     start_plant = require_design_plant(plant)
     nodes = _require_plain_nodes(network)
     # Second moments E (x, 1)(x, 1)' of the plant at each step, or in its steady state.
@@ -69,7 +72,8 @@ def paths_of(network: Network, error: Error) -> tuple[Paths, Float[np.ndarray, "
         seconds, start = [steady_moment_with_one(plant)] * steps, None
     else:
         check_horizon(steps, covered)
-        seconds, start = moments_with_one_over(plant, steps), np.asarray(start_plant.initial_covariance)
+        seconds = moments_with_one_over(plant, steps)
+        start = np.asarray(start_plant.initial_covariance)
     # Paths of each step, and the plant's A and Q.
     described = [_make_paths_of_step(nodes, k, np.asarray(second)) for k, second in enumerate(seconds)]
     plant_at = [at(plant, k) for k in range(steps)]
@@ -91,7 +95,10 @@ def paths_of(network: Network, error: Error) -> tuple[Paths, Float[np.ndarray, "
 
 
 def _require_plain_nodes(network: Network) -> dict[str, Node]:
-    """Return the nodes by name; raise ValueError for relays that filter, a shared channel, or senders not plain."""
+    """Return the nodes by name; raise ValueError for relays that filter, a shared channel, or senders not plain.
+
+    A plain node has a sensor that sends what it measures at each step, over a channel of its own.
+    """
     if network.relays is not None:
         raise fail("network", "a RelayNetwork alone, whose relays' gains are free", "a Network of relays that filter")
     if network.common is not None:
@@ -138,20 +145,11 @@ def _make_chain(parts: list[AbstractRandomAffine], rows: Float[np.ndarray, "k m1
     """
     if parts[-1].outputs != 1:
         raise _make_no_paths_error(f"one gain for {parts[-1].outputs} numbers")
+    maps, loss_factor = _take_losses_apart(parts)
     row = rows[0]
-    loss_factor = 1.0  # product of the losses' kappas
     has_offset = False  # whether a wire behind a hop has added a constant
     hops: dict[str, tuple[float, float]] = {}  # kappa and alpha by name
-    while parts:
-        affine = parts.pop(0)
-        # A loss that nobody observes is a random gain, 0 or 1, of kappa = 1 / P(arrival). The maps that it may lose
-        # take its place in the series.
-        if isinstance(affine, Mixture):
-            inner, factor = _split_loss(affine)
-            parts, loss_factor = [*inner.in_series, *parts], loss_factor * factor
-            continue
-        if not isinstance(affine, GainAndNoise):
-            raise _make_no_paths_error(type(affine).__name__)
+    for affine in maps:
         # The first map may combine several numbers; of a single one the hop's alpha holds the unit already.
         if not hops:
             row = np.asarray(affine.matrix)[0] @ rows if affine.inputs > 1 else rows[0]
@@ -173,11 +171,38 @@ def _make_chain(parts: list[AbstractRandomAffine], rows: Float[np.ndarray, "k m1
     return HopChain(row, hops)
 
 
+def _take_losses_apart(parts: list[AbstractRandomAffine]) -> tuple[list[GainAndNoise], float]:
+    """Return the maps of a series without its unobserved losses, and the product of the losses' kappas.
+
+    A loss that nobody observes is a random gain, 0 or 1, of kappa = E g^2 / (E g)^2 = 1 / P(arrival). The maps that it
+    may lose take its place in the series. `parts`: the maps of the series, in the order in which a signal passes them.
+
+    Raises:
+        ValueError: maps that are neither losses nor of one gain and noise.
+    """
+    left, maps, loss_factor = list(parts), list[GainAndNoise](), 1.0
+    while left:
+        affine = left.pop(0)
+        if isinstance(affine, Mixture):
+            inner, factor = _split_loss(affine)
+            left = [*inner.in_series, *left]
+            loss_factor = loss_factor * factor
+        elif isinstance(affine, GainAndNoise):
+            maps.append(affine)
+        else:
+            raise _make_no_paths_error(type(affine).__name__)
+    return maps, loss_factor
+
+
 def _compute_hop_kappa_and_alpha(hop: GainAndNoise) -> tuple[float, float]:
-    """Return kappa = E g^2 / (E g)^2 and alpha = Var m / E g^2 of a hop that delivers g sent + m."""
+    """Return kappa = E g^2 / (E g)^2 and alpha = Var m / E g^2 of a hop that delivers g sent + m.
+
+    These two numbers are all that the information of a path needs of a hop.
+    """
     if len(hop.law.extremes()) > 1:
         raise _make_no_paths_error("a gain with uncertain probabilities")
-    mean, square = float(hop.law.moment(1)), float(hop.law.moment(2))
+    mean = float(hop.law.moment(1))
+    square = float(hop.law.moment(2))
     if mean == 0:
         raise fail("hop", "a gain whose mean is not zero (a linear filter receives no signal else)", "mean 0")
     if np.any(np.asarray(hop.noise.mean)):
@@ -210,10 +235,17 @@ def _make_no_paths_error(got: str) -> ValueError:
 
 
 class _PathsOfStep(NamedTuple):
-    """Lists of one step, filled path by path.
+    """Lists of one step, filled path by path; a path carries y = c x + v over its hops.
 
-    Of each path its row c, second = s = E y^2 and signal = t = s - Var v; of each hop kappa, alpha, the power that it
-    sends at present, its name, and the number of its path.
+    Args:
+        rows: c of each path.
+        second: s = E y^2 of each path.
+        signal: t = s - Var v of each path.
+        kappa: of each hop.
+        alpha: of each hop.
+        powers: what each hop's transmitter sends at present.
+        names: name of each hop's transmitter.
+        path: number of each hop's path.
     """
 
     rows: list[np.ndarray]
@@ -246,7 +278,8 @@ def _make_paths_of_step(nodes: Mapping[str, Node], k: int, state: Float[np.ndarr
             raise fail(f"sensor of {name!r}", "a LinearSensor", type(sensor).__name__)
         refuse_angles("design", sensor)
         # Chains of the channel, and what their transmitters send at present, by E (y, 1)(y, 1)' of the outputs.
-        measured, noise = np.asarray(measured_moment_with_one(sensor, state)), np.asarray(sensor.noise.covariance)
+        measured = np.asarray(measured_moment_with_one(sensor, state))
+        noise = np.asarray(sensor.noise.covariance)
         chains = find_hop_chains(channel, np.eye(len(sensor.outputs), len(measured)))
         sent_powers = compute_sent_powers(channel, measured, k)
         _check_uncorrelated(name, np.array([chain.row[:-1] for chain in chains]), noise)
@@ -271,8 +304,13 @@ def _make_paths_of_step(nodes: Mapping[str, Node], k: int, state: Float[np.ndarr
 def _check_uncorrelated(name: str, rows: Float[np.ndarray, "path m"], covariance: Float[np.ndarray, "m m"]) -> None:
     """Raise ValueError if two paths of a node carry correlated noise of its sensor.
 
-    `rows`: the combination of outputs that each path carries. `covariance`: of the sensor's noise. A correlation up to
+    A correlation up to
     UNCORRELATED counts as rounding.
+
+    Args:
+        name: name of the node, for messages.
+        rows: the combination of outputs that each path carries (path, m).
+        covariance: covariance of the sensor's noise (m, m).
     """
     path_covariance = rows @ covariance @ rows.T
     variances = np.diag(path_covariance)

@@ -27,11 +27,45 @@ from heliograph.planning.sequential_quadratic_programming import (
 Mask = Bool[np.ndarray, "time free"]
 
 
+class ErrorSlopes(NamedTuple):
+    """Error of paths at some powers, and its derivatives, both (time, free).
+
+    Args:
+        error: the error, smoothed if it is an eigenvalue.
+        weights: -d error / d j, with j the information of the path of each free hop: what more information is worth.
+        gradient: d error / d p, by the power of each free hop.
+    """
+
+    error: float
+    weights: Powers
+    gradient: Powers
+
+
+class ErrorTangent(NamedTuple):
+    """A criterion's linear lower bound as a problem of its own, and its value and gradient where both errors are equal.
+
+    Args:
+        problem: the problem with the linear criterion.
+        value: its error at the powers of the tangent.
+        gradient: its derivative by the free powers there (time, free).
+    """
+
+    problem: "PathProblem"
+    value: float
+    gradient: Powers
+
+
 class PathProblem(NamedTuple):
     """Error of paths as a function of free powers (time, free), as a descent needs it.
 
-    path: number of the path of each free column. information: free powers -> j of each path and dj/dp of each column, j
-    being the information that a path carries at a step. limits: of the free powers. scale: size of the powers.
+    Args:
+        paths: the paths, each a chain of hops from one sensor to the receiver.
+        criterion: the number made of the error covariances that is to be small.
+        path: number of the path of each free hop (free,).
+        information: function of the free powers that returns j of each path, the information that it carries at a
+            step, and dj/dp of each free hop.
+        limits: of the free powers.
+        scale: size of the powers.
     """
 
     paths: Paths
@@ -49,45 +83,52 @@ class PathProblem(NamedTuple):
         """Return the error at these powers, without smoothing of an eigenvalue."""
         return self.criterion.compute_exact_error(self.covariances(powers))
 
-    def sensitivity(self, powers: Powers) -> tuple[float, Powers, Powers]:
-        """Return the error, -d error / d j of each free hop's path, and d error / d p, both (time, free), at powers p.
+    def sensitivity(self, powers: Powers) -> ErrorSlopes:
+        """Return the error at powers p (time, free), -d error / d j of each free hop's path, and d error / d p.
 
-        j is the information of a path, and `self.path` the path of each free hop. One adjoint recursion gives both.
+        j is the information of a path, and d error / d p = (d error / d j) (dj/dp). One adjoint recursion gives the
+        derivatives by all j.
         """
-        information, slope = self.information(powers)
+        information, slope = self.information(powers)  # j (time, path), and dj/dp (time, free)
         p = compute_error_covariances(self.paths, information)
-        value, weights = self.criterion.smooth(p)
-        by_information = compute_path_sensitivities(self.paths, information, p, weights)[:, self.path]
-        return value, by_information, -by_information * slope
+        smoothed = self.criterion.smooth(p)
+        weights_of_paths = compute_path_sensitivities(self.paths, information, p, smoothed.slopes)
+        weights = weights_of_paths[:, self.path]
+        return ErrorSlopes(error=smoothed.value, weights=weights, gradient=-weights * slope)
 
     def evaluate(self, x: Vector, sharpness: int | None) -> Evaluation:
-        """Return the error, the powers and their derivatives at x (all powers in a row), with this smoothing."""
+        """Return the error, the powers and their derivatives at x, the free powers step after step.
+
+        `sharpness`: smoothing of the error if it is an eigenvalue; None of a trace.
+        """
         powers = np.maximum(x, 0.0).reshape(self.limits.peak.shape)
         smoothed = self._replace(criterion=self.criterion._replace(sharpness=sharpness))
-        value, _, gradient = smoothed.sensitivity(powers)
-        return Evaluation(value, gradient.ravel(), powers.ravel(), np.eye(x.size))
+        at_powers = smoothed.sensitivity(powers)
+        return Evaluation(at_powers.error, at_powers.gradient.ravel(), powers.ravel(), np.eye(x.size))
 
-    def make_support(self, powers: Powers) -> tuple["PathProblem", float, Powers]:
-        """Return a problem whose error is at most this one's, and equal at `powers`; then its value and gradient there.
+    def make_support(self, powers: Powers) -> ErrorTangent:
+        """Return a problem whose error is at most this one's, and equal at `powers` (time, free).
 
-        Its error is linear in the covariance P: the tangent of this criterion at the P of these powers (time, free).
+        Its criterion is linear in the covariance P: the tangent of this criterion at the P of these powers.
         """
         problem = self._replace(criterion=self.criterion.make_tangent(self.covariances(powers)))
-        value, _, gradient = problem.sensitivity(powers)
-        return problem, value, gradient
+        at_powers = problem.sensitivity(powers)
+        return ErrorTangent(problem, at_powers.error, at_powers.gradient)
 
     def lower_bound(self, powers: Powers) -> float:
         """Return Frank and Wolfe's lower bound f(p) + min over allowed q of grad f(p).(q - p) of a convex error f."""
-        _, value, gradient = self.make_support(powers)
-        return float(value + np.sum(gradient * (self.limits.find_best_powers(-gradient) - powers)))
+        tangent = self.make_support(powers)
+        least_on_tangent = self.limits.find_best_powers(-tangent.gradient)
+        return float(tangent.value + np.sum(tangent.gradient * (least_on_tangent - powers)))
 
     def bound_least_total(self, powers: Powers, target: float) -> float:
-        """Return the least total power at which the tangent at p reaches the target, found by bisection.
+        """Return the least total power at which the error's tangent at `powers` reaches the target, by bisection.
 
         A convex error is nowhere below its tangent, so it needs at least this power.
         """
         _, value, gradient = self.make_support(powers)
-        low, high = 0.0, float(powers.mean(axis=0).sum()) * (1 + 1e-9)
+        low = 0.0
+        high = float(powers.mean(axis=0).sum()) * (1 + 1e-9)
         for _ in range(100):
             middle = (low + high) / 2
             best = self.limits._replace(total=middle).find_best_powers(-gradient)
@@ -117,9 +158,13 @@ class PathProblem(NamedTuple):
 
 
 class PowerTask(NamedTuple):
-    """A problem in the free powers (time, free), which hops are free, what the others send, and starts of a search.
+    """A problem in the free powers, and what its search needs.
 
-    fixed: powers that all hops send at present, of which those of the free ones do not matter.
+    Args:
+        problem: the error as a function of the free powers (time, free).
+        free: which hops are free (hop,).
+        fixed: powers that all hops send at present (time, hop), of which those of the free ones do not matter.
+        starts: free powers at which searches begin, (time, free) each.
     """
 
     problem: PathProblem
@@ -144,7 +189,8 @@ class PowerTask(NamedTuple):
         """
         problem, limits = self.problem, self.problem.limits
         steps, count = problem.paths.second.shape  # (time, paths)
-        peak, mean = np.zeros((steps, count)), np.zeros(count)  # limits of a path: the sums of its hops' limits
+        peak = np.zeros((steps, count))
+        mean = np.zeros(count)  # limits of a path: the sums of its hops' limits
         np.add.at(peak.T, problem.path, limits.peak.T)
         np.add.at(mean, problem.path, limits.mean)
         cap = np.minimum(np.minimum(peak, mean * steps), limits.total * steps)
@@ -220,6 +266,10 @@ def _choose_total(limits: PowerLimits, paths: Paths) -> float:
     """Return the total power of starts if no total is given: the sum over transmitters of what each may send.
 
     Its limits are of peak and mean. Without any it is ten times the largest alpha, where half of what arrives is noise.
+
+    Args:
+        limits: limits of the free powers.
+        paths: the paths, for the noise of their hops (`alpha`, in units of sent power).
     """
     largest_means = np.minimum(limits.peak.mean(axis=0), limits.mean)  # of each transmitter
     without_limit = 10 * max(paths.alpha.max(), np.finfo(float).tiny)
@@ -230,7 +280,13 @@ def choose_supports(path: Int[np.ndarray, "free"], steps: int, starts: int, seed
     """Return a mask (steps, free) for each start of a search: which free hops send power at which step.
 
     In the first all hops send. In each other one some whole paths send at each step: every choice if there are at most
-    `starts`, else random ones. A convex problem needs the first only. `path`: number of the path of each free hop.
+    `starts`, else random ones. A convex problem needs the first only.
+
+    Args:
+        path: number of the path of each free hop (free,).
+        steps: number of steps.
+        starts: largest number of masks.
+        seed: of the choices that are drawn.
     """
     whole = np.ones((steps, len(path)), dtype=bool)
     if is_convex(path):

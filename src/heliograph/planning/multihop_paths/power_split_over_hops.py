@@ -25,16 +25,22 @@ from heliograph.planning.multihop_paths.model import (
 
 NEWTON_STEPS = 60  # of the root in l, on a logarithmic scale on which Newton's steps cannot leave it
 BISECTIONS = 120  # of log l between ends: 2^-120 of their distance, 138, is far below its rounding
-ENDS = 1e-30, 1e30  # of l, times the largest alpha
-SETTLED = 1e-15  # relative change of log l at which Newton's steps end
-DEAD = 1e150  # noise of a path in which a hop that is not free sends nothing
+MULTIPLIER_ENDS = 1e-30, 1e30  # of l, times the largest alpha
+CONVERGED_STEP = 1e-15  # relative change of log l at which Newton's steps end
+DEAD_PATH_NOISE = 1e150  # noise of a path in which a hop that is not free sends nothing
 LARGEST = 1e100  # powers and noises, whose squares doubles hold
 
 Hops = Float[np.ndarray, "time path hops"]
 
 
 class PowerSplit(NamedTuple):
-    """Powers of the hops of each path, information j of the path, and dj/dP."""
+    """Best split of each path's power P over its hops.
+
+    Args:
+        powers: power of each hop (time, path, hops).
+        information: j, what the path then carries (time, path).
+        slope: dj/dP (time, path).
+    """
 
     powers: Hops
     information: PathValues
@@ -42,10 +48,13 @@ class PowerSplit(NamedTuple):
 
 
 class SplitPaths(NamedTuple):
-    """Paths by the power P that their free hops send together.
+    """Paths by the power P that their free hops send together: j = 1 / (A prod_h (1 + alpha_h / p_h) - t), sum p_h = P.
 
-    full: A = s K over what hops of fixed power let pass; signal: t; alpha: of the free hops, zeros where a path has
-    fewer than another.
+    Args:
+        full: A = s K over what hops of fixed power let pass (time, path).
+        signal: t (time, path).
+        alpha: noise of each free hop in units of sent power, 0 where a path has fewer hops than another
+            (time, path, hops).
     """
 
     full: PathValues
@@ -58,7 +67,7 @@ def split_paths(paths: Paths, free: Bool[np.ndarray, "hop"], fixed: Powers) -> S
 
     A path's information is j = 1 / (A prod_h (1 + alpha_h / p_h) - t), with the product over its free hops. A (`full`)
     is s K prod (1 + alpha / p) over the hops of fixed power, s = E y^2 (`second`) and K the product of all kappa.
-    `fixed`: powers (time, hop). DEAD: the A of a path through a hop that sends nothing.
+    `fixed`: powers (time, hop). DEAD_PATH_NOISE: the A of a path through a hop that sends nothing.
     """
     full = paths.second * compute_path_kappas(paths)
     # Gather alpha of the free hops by path.
@@ -70,8 +79,10 @@ def split_paths(paths: Paths, free: Bool[np.ndarray, "hop"], fixed: Powers) -> S
     share = share_of_signal(fixed, paths.alpha)
     for h in np.flatnonzero(~free):
         i = paths.path[h]
-        full[:, i] = np.where(share[:, h] > 0, full[:, i] / np.maximum(share[:, h], 1 / DEAD), DEAD)
-    return SplitPaths(full=np.minimum(full, DEAD), signal=paths.signal, alpha=alpha)
+        full[:, i] = np.where(
+            share[:, h] > 0, full[:, i] / np.maximum(share[:, h], 1 / DEAD_PATH_NOISE), DEAD_PATH_NOISE
+        )
+    return SplitPaths(full=np.minimum(full, DEAD_PATH_NOISE), signal=paths.signal, alpha=alpha)
 
 
 def split_power(alpha: "Float[ArrayLike, ' H']", total: "Float[ArrayLike, '']") -> Float[np.ndarray, "H"]:
@@ -90,7 +101,8 @@ def split_power(alpha: "Float[ArrayLike, ' H']", total: "Float[ArrayLike, '']") 
     Raises:
         ValueError: a negative noise or total, no hops, or numbers whose squares overflow or underflow.
     """
-    noise, power = check_hop_noises(alpha), float(scalar("total power", total, 0.0))
+    noise = check_hop_noises(alpha)
+    power = float(scalar("total power", total, 0.0))
     if not np.any(noise):
         return np.zeros(len(noise))
     if power and not 1 / LARGEST <= power <= LARGEST:
@@ -123,23 +135,24 @@ def split_power_over_hops(whole: SplitPaths, total: PathValues) -> PowerSplit:
             alpha (time, path, hop), 0 where a path has fewer hops than another.
         total: the power P of each path at each step (time, path).
     """
-    alpha, power = whole.alpha, np.where(total > 0, total, 1.0)[..., None]  # any power where there is none: see below
+    alpha = whole.alpha
+    power = np.where(total > 0, total, 1.0)[..., None]  # any power where there is none: see below
     hops = (alpha > 0).sum(axis=-1)  # number of a path's free hops with noise
     # The powers p_h(l), (time, path, hop), of exactly this sum.
     log_l = _find_multiplier(alpha, power)
-    p = _split_at_multiplier(alpha, log_l)[0]
+    p, _ = _split_at_multiplier(alpha, log_l)
     reached = p.sum(axis=-1, keepdims=True)
     p = p * np.divide(power, reached, out=np.ones_like(power), where=reached > 0)
     # j = (A / D) / (A - t A / D) and dj/dP = l D / (D - t)^2, in the ratio A / D, which vanishes with a power.
     ratio = share_of_signal(p, alpha).prod(axis=-1)
-    below = whole.full - whole.signal * ratio
+    denominator = whole.full - whole.signal * ratio  # A - t A / D
     sends = (total > 0) | (hops == 0)  # a path that needs no power is always there
-    slope = np.exp(log_l[..., 0]) * ratio * whole.full / below**2
+    slope = np.exp(log_l[..., 0]) * ratio * whole.full / denominator**2
     # Without power the information j is 0; its slope is 1 / (A alpha) with one hop, and 0 with several.
     slope_at_zero = np.divide(1.0, whole.full * alpha.sum(axis=-1), out=np.zeros_like(ratio), where=hops == 1)
     return PowerSplit(
         powers=np.where(sends[..., None], p, 0.0),
-        information=np.where(sends, ratio / below, 0.0),
+        information=np.where(sends, ratio / denominator, 0.0),
         slope=np.where(hops == 0, 0.0, np.where(sends, slope, slope_at_zero)),
     )
 
@@ -148,7 +161,11 @@ def _find_multiplier(alpha: Hops, power: np.ndarray) -> np.ndarray:
     """Return log l of each path (time, path, 1), with the multiplier l at which sum_h p_h(l) is the path's power P.
 
     Newton's method is applied to log sum_h p_h as a function of log l. It starts at l = (sum_h sqrt(alpha_h) / P)^2,
-    which is exact for large P. `power`: P > 0 (time, path, 1).
+    which is exact for large P.
+
+    Args:
+        alpha: noise of each hop in units of sent power (time, path, hop), 0 where a path has fewer.
+        power: P > 0 of each path (time, path, 1).
     """
     has_hops = (alpha > 0).any(axis=-1, keepdims=True)
     log_l: np.ndarray = 2 * np.log(np.where(has_hops, np.sqrt(alpha).sum(axis=-1, keepdims=True), 1.0) / power)
@@ -159,7 +176,7 @@ def _find_multiplier(alpha: Hops, power: np.ndarray) -> np.ndarray:
         # Newton's step: the slope of log(sum p) by log l is (d sum p / d log l) / sum p.
         step = np.divide(excess * total, negative_slope, out=np.zeros_like(total), where=negative_slope > 0)
         log_l = log_l + step
-        if np.all(np.abs(step) <= SETTLED * (1 + np.abs(log_l))):
+        if np.all(np.abs(step) <= CONVERGED_STEP * (1 + np.abs(log_l))):
             break
     return log_l
 
@@ -169,6 +186,10 @@ def _split_at_multiplier(alpha: np.ndarray, log_l: np.ndarray) -> tuple[np.ndarr
 
     p_h = 2 (alpha / l) / (root + alpha) with root = sqrt(alpha^2 + 4 alpha / l). This equals (root - alpha) / 2, but
     loses no digits by cancellation.
+
+    Args:
+        alpha: noise of each hop in units of sent power (time, path, hop), 0 where a path has fewer.
+        log_l: logarithm of the multiplier l of each path (time, path, 1).
     """
     inverse = np.exp(-log_l)
     root = np.sqrt(alpha**2 + 4 * alpha * inverse)
@@ -179,7 +200,13 @@ def _split_at_multiplier(alpha: np.ndarray, log_l: np.ndarray) -> tuple[np.ndarr
 
 
 class Envelope(NamedTuple):
-    """Concave envelope of j(P) on [0, cap]: a ray of this slope up to the power where it touches, then j itself."""
+    """Concave envelope of the information j(P) of each path on [0, cap]: a ray from 0 up to a power, then j itself.
+
+    Args:
+        whole: the paths, with j as a function of their power P.
+        touch: power up to which the ray goes, where it touches j (time, path).
+        ray: slope of the ray (time, path).
+    """
 
     whole: SplitPaths
     touch: PathValues
@@ -203,20 +230,25 @@ def compute_envelope(whole: SplitPaths, cap: PathValues) -> Envelope:
     the noise of its hops and p_h their powers. The best split of P = sum_h p_h has one multiplier l, dD/dP = -D l. With
     several hops j is S-shaped, and the envelope begins with a ray from 0. It touches j where j = P dj/dP, which is
     D (1 - P l) = t: found by bisection in log l, as the left side falls with l.
+
+    Args:
+        whole: the paths, as functions of the power that their free hops send together.
+        cap: largest power of each path (time, path).
     """
     alpha, hops = whole.alpha, (whole.alpha > 0).sum(axis=-1)
     largest = np.where(hops > 0, alpha.max(axis=-1), 1.0)
-    low, high = (np.log(end / largest) for end in ENDS)
+    low, high = (np.log(end / largest) for end in MULTIPLIER_ENDS)
     for _ in range(BISECTIONS):
         middle = (low + high) / 2
-        p = _split_at_multiplier(alpha, middle[..., None])[0]
+        p, _ = _split_at_multiplier(alpha, middle[..., None])
         noise = np.divide(alpha, p, out=np.zeros_like(p), where=p > 0)
         left_side = whole.full * np.prod(1 + noise, axis=-1) * (1 - p.sum(axis=-1) * np.exp(middle))
         is_above = left_side >= whole.signal
-        low, high = np.where(is_above, middle, low), np.where(is_above, high, middle)
+        low = np.where(is_above, middle, low)
+        high = np.where(is_above, high, middle)
     # The power where the ray touches, at most the cap, and its slope j(P) / P.
-    touch = np.where(hops > 1, _split_at_multiplier(alpha, low[..., None])[0].sum(axis=-1), 0.0)
-    touch = np.minimum(touch, cap)
+    p, _ = _split_at_multiplier(alpha, low[..., None])
+    touch = np.minimum(np.where(hops > 1, p.sum(axis=-1), 0.0), cap)
     at_touch = split_power_over_hops(whole, touch)
     ray = np.divide(at_touch.information, touch, out=np.zeros_like(touch), where=touch > 0)
     return Envelope(whole, touch, ray)

@@ -9,32 +9,24 @@ powers leads down, for the linearised error is concave in p; how far to go the s
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 
 from heliograph.numerics.types import Float
+from heliograph.planning.multihop_paths.path_problem import ErrorSlopes
 from heliograph.planning.multihop_paths.power_split_over_hops import SplitPaths
 from heliograph.planning.power_budget import PowerLimits, Powers
 
-CLOSED = 1e-14  # gap, of the error, at which the powers are the best but for rounding
-STEPS = 500
+CLOSED_GAP = 1e-14  # gap, of the error, at which the powers are the best but for rounding
+MOST_ITERATIONS = 500
 PATIENCE = 20  # iterations in a row that do not close the gap further
-TRIES = 12  # points on the way to other powers
-STEEPEST = 1e-9  # least a, of s kappa: below, a path that power makes free of noise is a little more than linear
-
-
-class ErrorSlopes(NamedTuple):
-    """Error at some powers, -d error / d j of each free hop's path, and d error / d p."""
-
-    error: float
-    weights: Powers
-    gradient: Powers
+MOST_TRIES = 12  # points on the way to other powers
+LEAST_SLOPE = 1e-9  # least a, of s kappa: below, a path that power makes free of noise is a little more than linear
 
 
 def water_filling(
     limits: PowerLimits,
-    sensitivity: Callable[[Powers], tuple[float, Powers, Powers]],
+    slopes_at: Callable[[Powers], ErrorSlopes],
     whole: SplitPaths,
     start: Powers,
 ) -> Powers:
@@ -47,28 +39,28 @@ def water_filling(
 
     Args:
         limits: the largest powers: of each transmitter at each time and on average, and of all together.
-        sensitivity: powers -> error, -d error / d j of each free hop's path, d error / d p.
+        slopes_at: function of powers p that returns the error, w = -d error / d j of each free hop's path, and
+            d error / d p.
         whole: the path of each free hop, as a function of that hop's power: j = 1 / (full (1 + alpha / p) - signal).
         start: powers at which to begin (time, free).
     """
     # At the power p of its free hop, a path has j = p / (a p + b), with a = full - signal and b = full alpha.
-    a = np.maximum(whole.full - whole.signal, STEEPEST * whole.full)
-    b = whole.full * whole.alpha[..., 0]
-
-    def slopes_at(powers: Powers) -> ErrorSlopes:
-        return ErrorSlopes(*sensitivity(powers))
-
-    # `best` are the powers with the least gap so far.
+    a = np.maximum(whole.full - whole.signal, LEAST_SLOPE * whole.full)
+    alpha = whole.alpha[..., 0]  # of the path's only free hop
+    b = whole.full * alpha
+    # `best` are the powers with the least gap so far. A gap of CLOSED_GAP (1e-14) of the error is only rounding.
     best = p = start
-    least_gap, idle = np.inf, 0  # iterations in a row without a smaller gap
+    least_gap = np.inf
+    idle = 0  # iterations in a row without a smaller gap
     slopes = slopes_at(p)
-    for _ in range(STEPS):
+    for _ in range(MOST_ITERATIONS):
         # The gap of Frank and Wolfe: how far the error's tangent at p falls within the limits. No powers gain more.
-        gap = float(np.sum(slopes.gradient * (p - limits.find_best_powers(-slopes.gradient))))
-        idle = 0 if gap < (1 - CLOSED) * least_gap else idle + 1
+        least_on_tangent = limits.find_best_powers(-slopes.gradient)
+        gap = float(np.sum(slopes.gradient * (p - least_on_tangent)))
+        idle = 0 if gap < (1 - CLOSED_GAP) * least_gap else idle + 1
         if gap < least_gap:
             least_gap, best = gap, p
-        if gap <= CLOSED * abs(slopes.error) or idle > PATIENCE:
+        if gap <= CLOSED_GAP * abs(slopes.error) or idle > PATIENCE:
             break
         # The powers that minimise -sum w j with the weights w = -d error / d j, and the best point on the way to them.
         filled = _fill_to_limits(limits, slopes.weights, a, b)
@@ -83,11 +75,17 @@ def _search_line(
 
     It is the end of the way if the error is less there and its slope small. Else shorter ways are tried, up to where a
     parabola with the slopes at both ends has its minimum. If none is accepted, rounding hides the descent: the result
-    is half of `way`, which brings p closer to the minimum still. `slopes`: those at p.
+    is half of `way`, which brings p closer to the minimum still.
+
+    Args:
+        slopes_at: function of powers that returns the error and its slopes.
+        p: powers at which the way begins (time, free).
+        slopes: the slopes there.
+        way: change of the powers to the end of the way (time, free).
     """
     slope = float(np.sum(slopes.gradient * way))
     length = 1.0
-    for _ in range(TRIES if slope < 0 else 0):
+    for _ in range(MOST_TRIES if slope < 0 else 0):
         tried = slopes_at(p + length * way)
         end_slope = float(np.sum(tried.gradient * way))
         if end_slope <= -0.5 * slope and tried.error <= slopes.error:
@@ -105,7 +103,8 @@ def _fill_to_limits(limits: PowerLimits, weights: Powers, a: Powers, b: Powers) 
     of the power. Here p = [y rise - ground]^+ with rise = sqrt(w b) / a and ground = b / a. j is the information of a
     path, and w (`weights`) is -d error / d j.
     """
-    rise, ground = np.sqrt(np.maximum(weights, 0.0) * b) / a, b / a
+    rise = np.sqrt(np.maximum(weights, 0.0) * b) / a
+    ground = b / a
     steps, transmitters = ground.shape
     # Find the level at which each transmitter reaches its mean, and then the level of the total.
     no_limit = np.full(steps, np.inf)
@@ -154,7 +153,10 @@ def _find_level(
         total: the sum that is wanted.
     """
     grows = rise > 0
-    rise, ground, peak, highest = rise[grows], ground[grows], peak[grows], highest[grows]
+    rise = rise[grows]
+    ground = ground[grows]
+    peak = peak[grows]
+    highest = highest[grows]
     if not rise.size or not np.isfinite(total):
         return np.inf
     # The sum is piecewise linear in the level: it bends where a power begins to grow, or stops.
