@@ -160,7 +160,7 @@ class CompiledFunction:
         if shared is None:
             shared = allocate_aligned(self.code.shared)
             pointers = self._list_addresses(arrays, outputs, shared)
-            self.once.choose_machine(1).run(pointers.ctypes.data, 0, 0, 1, 1)  # no scratch; block 0 to 1, of one run
+            self.once.choose_machine(1).run(pointers.ctypes.data, 0, 0, 1, 1)  # no scratch; blocks 0 to 1, of 1 run
             self._shared = shared if all(self.differs[len(self._first) :]) else None
         self._copy_shared_outputs(outputs, shared)
         return shared
@@ -173,7 +173,7 @@ class CompiledFunction:
     def _compute_blocks(self, call: MemoryOfCall, cores: int | None) -> None:
         """Compute all blocks (runs of one vector) of a call: in this thread if that is little work, else in several."""
         blocks, scratch = divide_rounded_up(call.runs, call.machine.width), self.code.scratch
-        # Blocks that a thread computes at a time: an even share, but no less than is worth a thread.
+        # Blocks that a thread computes at a time: an even share, SHARES a core, but at least LITTLE operations.
         even_share = divide_rounded_up(blocks, (cores or cpu_count()) * SHARES)
         share = max(even_share, divide_rounded_up(LITTLE, max(self.code.blocks.work, 1)))
         if cores == 1 or share >= blocks:
@@ -198,7 +198,11 @@ class InPlaceCode:
     """
 
     def __init__(self, compiled: CompiledFunction, runs: int, inputs: Mapping[int, np.ndarray]):
-        """Make the arrays of calls; `inputs` has those that are read in place, by the number of the argument."""
+        """Make the arrays of calls for `runs` runs, and choose how a call computes them.
+
+        `inputs` has arrays that are read in place, by the number of the argument among those that calls pass; the code
+        of `compiled` may have first arguments that are bound already (`compiled._first`).
+        """
         code, left_out, self.runs = compiled.code, len(compiled._first), runs
         self._compiled, differs = compiled, compiled.differs[left_out:]
         self.inputs = self._make_inputs(inputs)
@@ -253,8 +257,8 @@ class InPlaceCode:
             self._compiled._compute_blocks(call, cores=None)
 
     def _compute_shared(self, once: TieredCode) -> None:
-        """Compute what all runs share, and copy the shared results to every run's."""
-        once.choose_machine(1).run(self._addresses[0], 0, 0, 1, 1)
+        """Compute what all runs share by the code `once`, and copy the shared results to every run's row."""
+        once.choose_machine(1).run(self._addresses[0], 0, 0, 1, 1)  # no scratch; blocks 0 to 1, of 1 run
         self._compiled._copy_shared_outputs(self.outputs, self._memory[-1])
 
 
@@ -295,9 +299,9 @@ class SingleRunCode:
         self._call = self.machine.run, self.pointers.ctypes.data, self.scratch.ctypes.data
 
     def __call__(self) -> None:
-        """Compute `outputs` from `inputs`."""
+        """Compute the arrays `outputs` from the arrays `inputs`, by the machine code."""
         run, pointers, scratch = self._call
-        run(pointers, scratch, 0, 1, 1)
+        run(pointers, scratch, 0, 1, 1)  # blocks 0 to 1, that is one, of 1 run
 
 
 def compile(

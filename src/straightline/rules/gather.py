@@ -45,7 +45,8 @@ def _gather(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) ->
 def _is_inside(lowering: Lowering, equation: JaxprEqn, shape: tuple[int, ...], indices: np.ndarray) -> np.ndarray:
     """Return for each row of indices the node of a flag: whether its window lies inside an array of this shape.
 
-    A row holds the window's first index along each of the operation's axes. `slice_sizes` is the window's shape.
+    A node is an operation of the program, since data may decide an index. A row holds the window's first index along
+    each axis of `start_index_map`. `slice_sizes` is the window's shape.
     """
     axes, sizes = equation.params["dimension_numbers"].start_index_map, equation.params["slice_sizes"]
     flags = np.full(indices.shape[:-1], lowering.graph.constant(True, "bool"), dtype=object)
@@ -169,7 +170,10 @@ def _replace_indices(lowering: Lowering, indices: np.ndarray, column: int, numbe
 
 
 def _find_index_row(entry: tuple[int, ...], numbers: Any) -> tuple[int, ...]:
-    """Return the row of indices from which an entry of the result is gathered."""
+    """Return the index of the window that an entry of a gather's result comes from.
+
+    The result's axes are those of the windows, with the axes within a window (`numbers.offset_dims`) among them.
+    """
     return tuple(i for axis, i in enumerate(entry) if axis not in numbers.offset_dims)
 
 

@@ -46,7 +46,7 @@ def _new_key(graph: Graph, key: RandomKey, high: Node, low: Node) -> RandomKey:
 
 
 def _make_keys(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Return keys (...) made of words (..., 2)."""
+    """Return an array (...) of random keys made of the nodes of their two words, an array (..., 2)."""
     _check_key_type(equation.outvars[0])
     return [make_keys(inputs[0])]
 
@@ -128,7 +128,7 @@ def _gamma(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> 
 
 
 def _return_keys(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Return the keys as they are."""
+    """Return the random keys as they are: a copy of a key (JAX's `random_clone`) is the same key."""
     return inputs
 
 
@@ -191,7 +191,7 @@ def write_hash_function() -> str:
     lines: list[str] = []
 
     def op(text: str) -> str:
-        """Append an operation; return the new name of its result."""
+        """Append an instruction, given without its result; return the new name of its result."""
         lines.append(f"  %t{len(lines)} = {text}")
         return f"%t{len(lines) - 1}"
 

@@ -182,7 +182,7 @@ def expand_coefficients() -> list[list[float]]:
 
 
 def _replace_zero_by_tiny(x: jax.Array) -> jax.Array:
-    """Return x, a tiny number for zero."""
+    """Return x, with TINY in the place of 0, since Lentz's method divides by it: the next quotient makes up for it."""
     return jnp.where(x == 0, TINY, x)
 
 
@@ -251,9 +251,13 @@ def digamma(x: jax.Array) -> jax.Array:
 
 
 def _lower_igamma(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """Return P(a, x) of `igamma`, or Q(a, x) of `igammac`."""
-    below, above = _inline_in_double(regularised_incomplete_gammas, lowering, equation, inputs)
-    return [above if equation.primitive.name == "igammac" else below]
+    """Return P(a, x) for JAX's operation `igamma`, or Q(a, x) = 1 - P(a, x) for `igammac`, entry by entry.
+
+    P is the mass below x of the gamma law of shape a. `inputs` are the arrays a and x; the function that computes P and
+    Q, written with JAX, is lowered: added as scalar operations to the program that is being written (`lowering`).
+    """
+    p, q = _inline_in_double(regularised_incomplete_gammas, lowering, equation, inputs)
+    return [q if equation.primitive.name == "igammac" else p]
 
 
 def _inline_in_double(
@@ -272,7 +276,7 @@ def _inline_in_double(
 
 
 def _convert(lowering: Lowering, type: Type, value: Value) -> Value:
-    """Return an array's numbers in another type."""
+    """Return an array as nodes (scalar operations) that convert each of its numbers to another type."""
     nodes = lowering.nodes(value)
     return arrange_nodes((lowering.graph.node("convert", type, n) for n in nodes.ravel().tolist()), nodes.shape)
 

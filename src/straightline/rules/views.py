@@ -52,12 +52,12 @@ def _reverse(x: StridedArray, params: Any, shape: tuple[int, ...]) -> StridedArr
 
 
 def _transpose(x: StridedArray, params: Any, shape: tuple[int, ...]) -> StridedArray:
-    """Return a view with the axes in another order."""
+    """Return the view of an array in memory with its axes in the order of the operation's `permutation`."""
     return x.view(shape, [x.strides[a] for a in params["permutation"]])
 
 
 def _reshape(x: StridedArray, params: Any, shape: tuple[int, ...]) -> StridedArray | None:
-    """Return a view of another shape; None if no strides describe it."""
+    """Return the view of an array in memory in another shape; None if no strides describe it."""
     return x.view_in_shape(shape)
 
 
@@ -188,13 +188,17 @@ def _view_window(
 
 
 def _match_strides(view: StridedArray, shape: tuple[int, ...]) -> list[int]:
-    """Return the strides of a view in a shape that differs from its own by axes of length 1 alone: theirs are 0."""
+    """Return the strides of a view in another shape, which differs only in axes of length 1; their strides are 0."""
     strides = iter([stride for length, stride in zip(view.shape, view.strides, strict=True) if length != 1])
     return [next(strides) if length != 1 else 0 for length in shape]
 
 
 def _concatenate(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """Concatenate along the first axis in new memory, along another axis row by row."""
+    """Return the concatenation of arrays along the operation's axis, in new memory.
+
+    Along the first axis the arrays are put one behind another; along another axis a loop joins them row by row. Short
+    results, and arrays of known numbers, are concatenated as nodes (scalar operations), without memory.
+    """
     shape, axis = result_shape(equation), equation.params["dimension"]
     # As nodes if the result is short, or if all that is in memory is known numbers, which stay known then.
     arrays_in_memory = [x for x in inputs if isinstance(x, StridedArray)]
@@ -242,7 +246,8 @@ def _is_whole_buffer(x: StridedArray, block: Any) -> bool:
 def _copy_into(lowering: Lowering, x: Value, buffer: Buffer, start: int) -> None:
     """Store an array into a buffer, from index `start` on.
 
-    Up to TABLE entries, and arrays of nodes, are stored entry by entry. A longer array in memory is copied by a loop.
+    Up to TABLE entries, and arrays of nodes (scalar operations), are stored entry by entry. A longer array in memory is
+    copied by a loop.
     """
     graph = lowering.graph
     if x.size <= TABLE or not isinstance(x, StridedArray):

@@ -99,7 +99,10 @@ def erfc(x: Vector) -> Vector:
 
 
 def _evaluate_ranges(size: Vector) -> tuple[Vector, Vector, Vector]:
-    """Compute (erf x - x) / x near 0, erf x - AT_ONE near 1, erfc x beyond: each valid in its own range."""
+    """Return (erf x - x) / x, erf x - AT_ONE, and erfc x for numbers x >= 0 (`size`), each valid in its own range.
+
+    The first is valid below 0.84375, the second from there up to 1.25, and the third beyond.
+    """
     square = size * size
     centre = polynomial(square, CENTRE[0]) / polynomial(square, CENTRE[1])
     # Near 1 and beyond: one rational function whose coefficients and argument depend on where x is.
