@@ -87,6 +87,6 @@ def cache_arrays(function: Callable[P, T]) -> Callable[P, T]:
 
 
 def _make_read_only(leaf: Any) -> None:
-    """Make an array read-only; leave all else as it is."""
+    """Make a leaf of a cached result read-only if it is a NumPy array, since all callers share it."""
     if isinstance(leaf, np.ndarray):
         leaf.setflags(write=False)

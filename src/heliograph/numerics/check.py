@@ -137,7 +137,7 @@ def scalar(name: str, value: ArrayLike, low: float = -np.inf, high: float = np.i
 
 
 def _describe_range(low: float, high: float) -> str:
-    """Return in words which numbers lie between two limits."""
+    """Return in words, for an error, which numbers lie between two limits, either of which may be infinite."""
     if 0 < low <= TINY:  # the least positive double: a bound that says no more than "positive"
         return "a positive number" + (f" up to {high:g}" if high < np.inf else "")
     return f"a number of at least {low:g}" if high == np.inf else f"a number from {low:g} to {high:g}"
@@ -212,12 +212,12 @@ def flag(name: str, value: object) -> bool:
 
 
 def text(name: str, value: object) -> str:
-    """Return a value that is a text, or raise."""
+    """Return the value if it is a text; raise ValueError, which names it, for anything else."""
     return instance(name, value, str, "a text")
 
 
 def repeat_per_step(name: str, value: ArrayLike, count: int) -> np.ndarray:
-    """Return a number for each of `count` steps, from one for all or one each."""
+    """Return numbers (count,), one for each step, from one number for all steps or a list of one for each."""
     numbers: np.ndarray = np.broadcast_to(array(name, value, (count,) if rank(name, value) else ()), (count,))
     return numbers
 

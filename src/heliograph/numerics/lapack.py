@@ -45,12 +45,12 @@ def pseudo_solve(a: A, b: A, tolerance: float = 1e-12) -> A:
 
 
 def spectral_radius(matrix: Float[np.ndarray, "N N"]) -> float:
-    """Return the largest modulus of an eigenvalue."""
+    """Return the spectral radius of a square matrix, the largest modulus of an eigenvalue; 0 of an empty one."""
     return float(np.max(np.abs(np.linalg.eigvals(matrix)), initial=0.0))
 
 
 def regular_solve(a: Float[jax.Array, "n n"], b: Float[jax.Array, "n k"]) -> Float[jax.Array, "n k"]:
-    """Solve A X = B for a regular A; of a batch one after another, as `eigh`."""
+    """Return the solution X of A X = B for a regular A; a batch of systems is solved one by one, as in `eigh`."""
     return jnp.asarray(_regular_solve(a, b))
 
 

@@ -72,7 +72,7 @@ def warn_of_single(name: str, value: object) -> None:
 
 
 def describe_rounded(rounded: tuple[float, float]) -> str:
-    """Return in words which number was meant, and which it is."""
+    """Return in words which number was meant, and which it is, from these two: "0.1 is 0.1000000015"."""
     return f"{rounded[0]:g} is {rounded[1]:.10g}"
 
 
@@ -112,12 +112,12 @@ def as_real(value: object) -> jax.Array:
 
 
 def library(*values: object) -> Any:
-    """Return numpy for known numbers, jax.numpy where one is traced."""
+    """Return the module numpy for known numbers, or jax.numpy where one is traced: they have the same functions."""
     return jnp if is_traced(*values) else np
 
 
 def scipy_for(*values: object) -> Any:
-    """Return scipy, or jax.scipy where a number is traced."""
+    """Return the module scipy for known numbers, or jax.scipy where one is traced."""
     return jax.scipy if is_traced(*values) else scipy
 
 
@@ -168,7 +168,7 @@ def block_diagonal(blocks: Sequence[Any]) -> Any:
 
 
 def is_zero(value: Any) -> bool:
-    """Return whether a number is known to be zero."""
+    """Return whether all numbers of an array are known to be zero; of traced ones nothing is known."""
     return not is_traced(value) and not np.any(value)
 
 
