@@ -204,7 +204,15 @@ class StepCost(NamedTuple):
 
 
 def measure_step_cost(header: Path, source: Path, received: int, inputs: int, real: Real) -> StepCost:
-    """Return the bytes of code and the time of a step, compiled in a temporary folder."""
+    """Return the bytes of code and the time of a step, compiled and timed in a temporary folder.
+
+    Args:
+        header: the exported header.
+        source: the exported source.
+        received: count of the measurement's components.
+        inputs: count of inputs.
+        real: type of numbers in C.
+    """
     compiler = shutil.which(COMPILER)
     if compiler is None:
         return StepCost(code_bytes=None, nanoseconds=None)

@@ -15,6 +15,7 @@ from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import InputError, fail
 from heliograph.numerics.types import PyTree
 from straightline import Unsupported, to_c
+from straightline.c_function import CFunction
 
 Real = Literal["double", "float"]
 RESERVED = frozenset((
@@ -54,9 +55,9 @@ class StepProgram(NamedTuple):
     members: list[StateMember]
     read: list[StateMember]
     parts: list[PartOfStep]
-    computes: list[Any]
-    initial: Any
-    start_at: Any
+    computes: list[CFunction]
+    initial: CFunction
+    start_at: CFunction | None
     mean: str
     covariance: str
     counts: bool
@@ -135,7 +136,7 @@ def _make_state_members(state: PyTree, estimate: Estimate) -> tuple[list[StateMe
     return of_state, of_estimate
 
 
-def _find_same_result(number: int, parts: Sequence[Any], named: Sequence[StateMember]) -> int:
+def _find_same_result(number: int, parts: Sequence[CFunction], named: Sequence[StateMember]) -> int:
     """Return the number of the first array of the state that always equals array `number`, or `number` itself.
 
     Two arrays are always equal if they are so at the start (`named`) and after each of the `parts`: results[n].same is
@@ -154,7 +155,7 @@ def _lower_part_to_c(
     size: bool = False,
     kept: Sequence[int] | None = None,
     names: tuple[Sequence[StateMember], Sequence[StateMember]] = ((), ()),
-) -> Any:
+) -> CFunction:
     """Lower a part of a step from JAX to a function of C and return that; all arguments but the measurement are finite.
 
     Args:
@@ -194,7 +195,7 @@ def _lower_part_to_c(
     )
 
 
-def _lower_start_to_c(filter: AbstractFilter, kept: list[int], names: list[str], prefix: str, real: Real) -> Any:
+def _lower_start_to_c(filter: AbstractFilter, kept: list[int], names: list[str], prefix: str, real: Real) -> CFunction:
     """Lower to C, and return, the function that makes the members of a state from a mean and a covariance.
 
     Members are the arrays of the filter's state as a C struct. The last result, `none`, is a flag: the arguments are no
@@ -258,7 +259,7 @@ def _find_symmetric_arrays(parts: Sequence[PartOfStep]) -> set[int]:
 
 
 def make_unsupported_error(operation: str, where: str) -> InputError:
-    """Return an error, in one line, about an operation that cannot be exported."""
+    """Return the error of an operation that C does not have: its name, and the line of code that it comes from."""
     return fail("export", "operations that C has", f"{operation} at {where}")
 
 
@@ -279,5 +280,5 @@ def name_state_arrays(state: PyTree) -> list[str]:
 
 
 def _is_symmetric(value: np.ndarray) -> bool:
-    """Return whether an array is a symmetric matrix of more than one row."""
+    """Return whether an array is a symmetric matrix; a matrix of one row, which has no pairs of entries, is none."""
     return value.ndim == 2 and len(value) > 1 and np.array_equal(value, value.T)
