@@ -54,9 +54,10 @@ Ended = TypeVar("Ended", bound=WithEnds)
 
 
 class FunctionInUnits(Module):
-    """A function f of vectors, in other units: r f(x_1 / a_1, ...). Functions in all units share one program.
+    """A function f of vectors in old units as the function r f(x_1 / a_1, ...) of vectors in new units.
 
-    result_factors: r, new units of the result per old one. argument_factors: a_1, ..., the same of each argument.
+    A number in new units is a factor times that in old ones. result_factors: r, the factors of the result's entries.
+    argument_factors: a_1, ..., those of each argument's entries. Functions in all units share one compiled program.
     """
 
     function: Callable[..., ArrayLike]
@@ -64,7 +65,11 @@ class FunctionInUnits(Module):
     argument_factors: tuple[np.ndarray, ...]
 
     def __call__(self, *vectors: jax.Array) -> jax.Array:
-        """Return the function's value in the new units, of vectors in the new units."""
+        """Return r f(x_1 / a_1, ...): the value in new units of the function f, of vectors x_1, ... in new units.
+
+        A number in new units is its factor times the number in old units: a_1, ... (`argument_factors`) for the entries
+        of each vector, r (`result_factors`) for those of the value. f (`self.function`) takes and returns old units.
+        """
         in_old_units = (x / factors for x, factors in zip(vectors, self.argument_factors, strict=True))
         return jnp.asarray(self.result_factors) * jnp.asarray(self.function(*in_old_units))
 
@@ -144,7 +149,7 @@ def _rescale_gaussian(filter: GaussianFilter | OpenLoop, units: Units) -> Gaussi
 
 
 def _require_gaussian(filter: AbstractFilter) -> GaussianFilter:
-    """Return the filter, which has to be Gaussian."""
+    """Return the filter, with its type checked: a part of a sequential filter or of a predictor is Gaussian."""
     assert isinstance(filter, GaussianFilter)
     return filter
 
@@ -251,18 +256,24 @@ def _rescale_moments(channel: SecondOrder | OverTime, units: Units) -> SecondOrd
 def rescale_channel(channel: SecondOrder, units: Units) -> SecondOrder:
     """Return the second moments of a channel z = G y + n in other units: of outputs R y and measurements Q z.
 
-    In these units it is z = Q G R^-1 y + Q n, where R and Q are diagonal matrices of the factors in `units`. `factor`
-    holds for each pair of entries of (G, n) the product of the entries' factors, which scales their second moment.
+    In these units it is z = Q G R^-1 y + Q n, where R and Q are diagonal matrices of the factors in `units`. With
+    M = (G, n), the second moment E[M_ia M_jb] of two entries is multiplied by the product of the entries' factors.
     """
-    q, (_, factor) = units.received, _list_channel_factors(units)
+    _factors_of_entries, factors_of_pairs = _list_channel_factors(units)
 
     def scale(moments: QuadraticMap) -> QuadraticMap:
-        """Return second moments of (G, n) in the other units."""
-        return QuadraticMap(factor * moments.center, factor * moments.radius)
+        """Return second moments of M in the other units.
 
-    gain, offset = q[:, None] * channel.mean_gain / units.outputs, q * channel.offset
+        A moment that is uncertain lies within +- `radius` of `center`, so that both are scaled alike.
+        """
+        return QuadraticMap(factors_of_pairs * moments.center, factors_of_pairs * moments.radius)
+
+    q = units.received
+    mean_gain, mean_offset = q[:, None] * channel.mean_gain / units.outputs, q * channel.offset
+    mean = np.concatenate([mean_gain, mean_offset[:, None]], axis=1)
+    # The covariance of M, the square of the error of its mean, E[M_ia M_jb], and the covariance of the nominal law;
+    # the first three are bounds where the channel's law is uncertain.
     spread, shift, power, nominal = map(scale, (channel.spread, channel.shift, channel.power, channel.nominal))
-    mean = np.concatenate([gain, offset[:, None]], axis=1)
     return describe_second_moments(mean, spread, shift, power, nominal, channel.uncertain)
 
 

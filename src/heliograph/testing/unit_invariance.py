@@ -267,7 +267,15 @@ def _rescale_fusion(name: str, fusion: Fusion | AbstractFilter, units: Units) ->
 
 
 def _has_search_in_estimate(network: Network, node: str, name: str) -> bool:
-    """Return whether this estimate depends on a search that minimises a trace."""
+    """Return whether an estimate of a network depends on a search that minimises the trace of a covariance.
+
+    The result of such a search depends on units, since a trace adds squares of different ones.
+
+    Args:
+        network: the network.
+        node: name of a node, or `Network.FUSED` for a fusion of all.
+        name: name of the node's filter, or of the fusion.
+    """
     if node != Network.FUSED:
         return _has_search(network.nodes[node].filters[name])
     fusion = network.fused[name]
