@@ -50,8 +50,10 @@ def design(
 
 
 def count_stages(file: "DesignFile") -> int:
-    """Return the approximate number of steps for the progress bar."""
-    # They are the design, the rows of the map, the budgets of the front, and about three changes for each node.
+    """Return the approximate number of steps of `compute_design`, for its progress bar.
+
+    They are the design, the rows of the map, the budgets of the front, and about three changes for each node.
+    """
     from heliograph.planning.design_comparisons import POINTS
 
     rows = 0 if file.map is None else len(file.map.y)

@@ -185,7 +185,10 @@ def _select_rows_of_record(record: "Record", rows: "np.ndarray | None") -> "Reco
 
 
 def _make_forecasts(record: "Record", ahead: "Horizons") -> "ByFilter":
-    """Return forecasts from the last row by node and filter; inputs are held as they are there."""
+    """Return forecasts from a record's last row by node and filter; inputs stay what they are in that row.
+
+    `ahead` says how far: a number of rows, or a list of spans of time, dates and numbers.
+    """
     forecasts = heliograph.forecast(record, ahead, inputs="held")
     assert isinstance(forecasts, dict)  # the record is of a network
     return forecasts
@@ -291,6 +294,6 @@ def _make_estimates_writer(data: "MeasuredPlant", module: "Mapping[str, object]"
 
 
 def _find_date_of_time_zero(data: "MeasuredPlant") -> "np.datetime64 | None":
-    """Return the date of time 0, of messages whose times are dates."""
+    """Return the date that the times of a plant's messages count from; None of rows, steps, and times without dates."""
     messages = data.events
     return None if messages is None or messages.steps or messages.numbers else messages.date

@@ -40,7 +40,7 @@ class WorthOptions:
 
     @property
     def is_asked(self) -> bool:
-        """Return whether anything is asked."""
+        """Return whether a case is asked for: a node to leave out, an outage, or a node to try."""
         return bool(self.without or self.outage or self.added)
 
 
