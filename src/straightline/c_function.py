@@ -193,7 +193,15 @@ def _declare_function(name: str, arguments: Sequence[CArray], results: Sequence[
 def _describe_results(
     names: Sequence[str], program: ClosedJaxpr, outputs: Sequence[np.ndarray], flat: Sequence[list[Node]], real: Real
 ) -> list[CArray]:
-    """Describe the arrays that a C function writes: name, type, length, whether symmetric, and which are the same."""
+    """Return the description of each array that a C function writes, its results.
+
+    Args:
+        names: their names in C.
+        program: the traced function, which has their types.
+        outputs: arrays of nodes, the scalar operations that compute them.
+        flat: the nodes of each as a list; results of the same nodes are always equal, which `same` says.
+        real: C type of real numbers.
+    """
     results = []
     for n, (name, variable, value, nodes) in enumerate(zip(names, program.jaxpr.outvars, outputs, flat, strict=True)):
         aval: Any = variable.aval

@@ -385,7 +385,7 @@ class CSource:
 
 
 def _wrap_numbers(numbers: Sequence[str]) -> list[str]:
-    """Return the texts of numbers, each with a comma, as indented lines of at most WIDTH characters."""
+    """Return the texts of numbers as lines of C: each followed by a comma, at most WIDTH characters a line."""
     lines, line = [], "   "
     for number in numbers:
         if len(line) + len(number) + 2 > WIDTH:

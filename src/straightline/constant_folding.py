@@ -106,7 +106,7 @@ def _sign(a: Any) -> Any:
 
 
 def _round_away(a: Any) -> Any:
-    """Return the nearest whole number, of halves the one further from zero."""
+    """Return the whole number nearest to a, as a real number; of halves the one further from zero."""
     whole = np.trunc(a)
     return whole + np.copysign(1.0, a) if np.abs(a - whole) >= 0.5 else whole
 
@@ -169,7 +169,7 @@ OF_DOUBLES: dict[str, Callable[[float, float], float]] = {
 
 
 def _evaluate(graph: NodeMaker, op: str, type: Type, args: tuple[Node, ...]) -> Node | None:
-    """Return the constant that an operation on constants gives, or None for one that is not folded."""
+    """Return the node of the constant that an operation on constant nodes gives; None if it is left to the run."""
     if type == "f64" and op in OF_DOUBLES:
         return graph.constant(OF_DOUBLES[op](float(args[0].value), float(args[1].value)), type)
     numbers = [DTYPES[a.type](a.value) for a in args]

@@ -20,7 +20,7 @@ class Graph:
     """
 
     def __init__(self, max_nodes: int = 2 * LONGEST) -> None:
-        """Make a graph with one empty block, which is open; more than `max_nodes` nodes in all are refused."""
+        """Begin a program with one empty block, which is open; more than `max_nodes` nodes in all are refused."""
         self.max_nodes = max_nodes
         self.top = Block(None)  # the outermost block, around all loops
         self.current = self.top  # the open block

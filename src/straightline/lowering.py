@@ -37,7 +37,7 @@ class Lowering:
     """Lowering of JAX's operations one after another: each is written as scalar operations (nodes) into a graph."""
 
     def __init__(self, most: int = 2 * LONGEST) -> None:
-        """Begin a program without operations; more than `most` nodes are refused."""
+        """Begin a program without operations; more than `most` nodes (scalar operations) are refused."""
         self.graph = Graph(most)
         # Programs of custom operations, traced for one run, by the operation and the shapes of its arguments.
         self.kernels: dict[Any, ClosedJaxpr] = {}
@@ -114,7 +114,7 @@ class Lowering:
         return value.nodes(self.graph) if isinstance(value, StridedArray) else value
 
     def get_only_node(self, value: Value) -> Node:
-        """Return the only node of a condition; raise Unsupported if it has several entries."""
+        """Return the only entry of a condition, as a node; raise Unsupported if it has several."""
         nodes = self.nodes(value)
         if nodes.size != 1:
             raise Unsupported("a condition for each entry of an array")
@@ -200,7 +200,7 @@ def warn_once(text: str) -> None:
 
 
 def arrange_nodes(nodes: Iterable[Any], shape: tuple[int, ...]) -> np.ndarray:
-    """Return nodes, given in row-major order, as an array of objects of this shape."""
+    """Return nodes (or random keys), given in row-major order, as a NumPy array of objects of this shape."""
     flat = list(nodes)
     # NumPy must not look into the nodes, as np.array(flat) would.
     array = np.empty(len(flat), dtype=object)
@@ -249,7 +249,7 @@ def make_placeholder(shape: Sequence[int], dtype: Any) -> Any:
 
 
 def known_integers(value: np.ndarray) -> np.ndarray | None:
-    """Return an array of nodes as integers, or None if one of the nodes is not a constant."""
+    """Return an array of nodes as integers, or None if one of the nodes is no constant, so that data decide it."""
     flat: list[Node] = value.ravel().tolist()
     if any(x.op != "constant" for x in flat):
         return None
@@ -283,7 +283,10 @@ HALVED = {np.dtype(x): np.dtype(y) for x, y in (("f8", "f4"), ("i8", "i4"), ("u8
 
 
 def _halve_precision(example: Any) -> Any:
-    """Return an example of the type that JAX has for it without enable_x64; a number of Python as it is."""
+    """Return an example of an argument as JAX takes it in single precision: with types of half as many bits.
+
+    A number of Python, whose type JAX chooses, stays as it is.
+    """
     kind = getattr(example, "dtype", None)
     return make_placeholder(example.shape, HALVED[kind]) if kind in HALVED else example
 
@@ -314,7 +317,7 @@ def trace_function(function: Callable[..., PyTree], *examples: PyTree, single: b
 
 
 def _list_used_equations(jaxpr: Jaxpr) -> list[JaxprEqn]:
-    """Return the operations that a program's results need, and those with effects, such as printing."""
+    """Return the operations of JAX's program that its results need, and those with effects, such as printing."""
     # Go backward, since all uses of an operation's results come after it.
     needed = {v for v in jaxpr.outvars if isinstance(v, Var)}
     used: list[JaxprEqn] = []

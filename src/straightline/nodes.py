@@ -104,7 +104,7 @@ class Block:
         self.items, self.seen, self.owner = [], {}, None
 
     def list_enclosing_blocks(self) -> Iterator["Block"]:
-        """Yield this block and the enclosing ones, outermost last."""
+        """Yield this block and the blocks around it, the outermost last."""
         block: Block | None = self
         while block is not None:
             yield block
@@ -231,7 +231,7 @@ class Guard:
     __slots__ = ("block", "body", "condition", "results", "values")
 
     def __init__(self, body: Block, condition: Node):
-        """Make the statement that computes the block `body` where `condition` holds in some run."""
+        """Make the statement that computes the block `body` if `condition`, a flag, holds in some run."""
         self.body, self.condition = body, condition
         self.block: Block = body.parent  # type: ignore[assignment]
         body.owner = self

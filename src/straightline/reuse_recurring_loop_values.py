@@ -184,7 +184,10 @@ class RingBuffer:
         self._columns = [(buffers[type], types[:k].count(type)) for k, type in enumerate(types)]
 
     def store(self, nodes: Iterable[Node], row: Node) -> None:
-        """Store these numbers, in the order of the types, as a row of the ring."""
+        """Add to the open block of the program the stores of these numbers as a row of the ring.
+
+        There is one number of each of the ring's types, in their order; `row` is the node of the row's number.
+        """
         for n, (buffer, column) in zip(nodes, self._columns, strict=True):
             self._graph.store(buffer, n, column, buffer.shape[1:], (row,))
 

@@ -70,7 +70,10 @@ class CompiledScan:
         return jax.tree.unflatten(self._tree, outputs)
 
     def _count_rows(self, arrays: Sequence[np.ndarray]) -> int:
-        """Return the number of rows of a call; raise ValueError unless all arrays have the shapes of the example."""
+        """Return the number of rows of a call; raise ValueError unless all arrays have the shapes of the example.
+
+        In the example's shapes, ANY_LENGTH as the first length stands for the number of rows.
+        """
         count = next(
             (len(x) for x, s in zip(arrays, self._shapes, strict=True) if s[:1] == (ANY_LENGTH,) and x.ndim), 0
         )

@@ -59,7 +59,7 @@ class StridedArray:
     def view(
         self, shape: Sequence[int], strides: Sequence[int], offset: int = 0, *moves: tuple[int, Node]
     ) -> "StridedArray":
-        """Return another view of the same memory; `offset` and `moves` (stride, node) are added to this view's."""
+        """Return another view of the same memory; `offset` and `moves`, pairs (stride, node), add to this view's."""
         return StridedArray(self.buffer, tuple(shape), tuple(strides), self.offset + offset, (*self.moves, *moves))
 
     def row(self, index: Node | int) -> "StridedArray":

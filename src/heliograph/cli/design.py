@@ -61,7 +61,11 @@ def count_stages(file: "DesignFile") -> int:
 
 
 def compute_design(file: "DesignFile", advance: "Advance") -> "DesignResults":
-    """Compute the design, the least error over total powers around its own, what changes are worth, and the map."""
+    """Return what a task of a design asks for, computed: the designed powers, and what surrounds them.
+
+    That is the powers before, the least error over total powers around the design's own, what changes of the network
+    are worth, and a map of the error over sites of a node if the task has one. `advance` is called with the progress.
+    """
     import heliograph as hg
     from heliograph.files.design_file import make_designed_source
     from heliograph.planning.design_comparisons import list_totals_about

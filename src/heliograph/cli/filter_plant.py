@@ -195,7 +195,7 @@ def _make_forecasts(record: "Record", ahead: "Horizons") -> "ByFilter":
 
 
 def _describe_forecasts(forecasts: "ByFilter") -> str:
-    """Return a line on how far forecasts go, and with which inputs."""
+    """Return a line for the user on how far forecasts go, and with which inputs."""
     from heliograph.numerics.times.dates import format_times
 
     any_forecast = next(forecast for filters in forecasts.values() for forecast in filters.values())
@@ -205,7 +205,7 @@ def _describe_forecasts(forecasts: "ByFilter") -> str:
 
 
 def _select_times_of_predictions(predicted: "ByFilter", rows: "np.ndarray | None") -> "ByFilter":
-    """Return the predictions of some rows; `rows` is a mask, None for all."""
+    """Return the predictions, by node and filter, of the rows in the mask `rows` (rows,); None takes all rows."""
     if rows is None or rows.all():
         return predicted
     selected = {}
@@ -222,7 +222,16 @@ def _write_estimates(
     target: Path | StoreAddress,
     data: "MeasuredPlant",
 ) -> None:
-    """Write estimates, with rows of forecasts below them and columns of what was predicted where there are any."""
+    """Write a plant's estimates, with its forecasts as rows below them and its predictions as columns beside them.
+
+    Args:
+        write: writes estimates alone, to any target.
+        record: the estimates.
+        forecasts: forecasts after the last row, by node and filter; {} for none.
+        predicted: what was predicted of each row, by node and filter; {} for none.
+        target: the file or the table of a store.
+        data: the plant's data, which have its name and the date of time 0.
+    """
     if not forecasts and not predicted:
         write(record, target)
         return
@@ -270,7 +279,10 @@ def _write_lagged_estimates(
 
 
 def _make_estimates_writer(data: "MeasuredPlant", module: "Mapping[str, object]") -> "Write":
-    """Return a function that writes estimates to a store, a table, or MCAP with the pose that `module` names."""
+    """Return the function that writes a plant's estimates to a store, a table, or a bag (MCAP).
+
+    `module` holds the names in the network's file; its `pose` says which states are the pose in a bag.
+    """
     from heliograph.files.bags.estimates_writer import write_bag
     from heliograph.files.estimates.estimates_table import estimate_columns, write_estimates
     from heliograph.files.stores.store_tables import write_columns_to_store

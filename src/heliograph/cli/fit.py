@@ -275,7 +275,10 @@ def _fit_with_progress(
 
 
 def collect_results_files(learned: "FitResults", out: Path, network: str) -> "ResultsContent":
-    """Return what goes into the results folder of a fit: figures, page, summary, network with the fitted numbers."""
+    """Return what goes into the results folder `out` of a fit: figures, page, summary, network with the fitted numbers.
+
+    `network` is the network as the user named it, FILE or FILE:NAME.
+    """
     from heliograph.files.fitted import as_json, write_fitted
     from heliograph.report.pages.fit import draw_fit_figures, make_page_of_drawings
     from heliograph.report.results_folder import ResultsContent

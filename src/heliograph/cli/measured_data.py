@@ -208,7 +208,11 @@ def read_rows(path: "Path | StoreTable", network: "Network", options: ReadingOpt
 
 
 def _make_rows_of_events(events: "EventTable", plant: str, options: ReadingOptions) -> MeasuredPlant:
-    """Return the rows of a plant from its events, with a line by node on how many events were used, late or lost."""
+    """Return the data of one plant as rows of time, made from its events, the messages with measured values.
+
+    The options say how late an event may come to be used. The result has a line for each node on how many events were
+    used, came too late, and so on, and on how many were lost by the numbers of their sequence.
+    """
     import numpy as np
 
     window, ahead = options.limits

@@ -181,7 +181,7 @@ def _check_options(
 
 
 def _describe_results(record: "Record", out: Path | StoreAddress | None, report: Path | None) -> list[str]:
-    """Return a line on what was written where, and one on the errors of each filter."""
+    """Return a line on what was written to `out` and `report`, and a line on the errors of each filter, if known."""
     written = WrittenRowCounts()
     written.add(record)
     targets = [path for path in (out, report and report / "report.html") if path is not None]

@@ -78,7 +78,7 @@ def check_numbers(name: str, numbers: Any, shape: tuple[int | str | None, ...], 
 
 
 def _describe_shape(shape: tuple[int | str | None, ...], dimensions: int) -> str:
-    """Return a shape in words, with an example if an array of fewer dimensions came."""
+    """Return an expected shape in words, for an error, with an example if an array of fewer `dimensions` came."""
     if shape == (None,):
         return "a list of numbers, such as [1, 0]"
     words = ("rows", "columns") if len(shape) == 2 else ("any",) * len(shape)  # for lengths that are free
@@ -184,7 +184,7 @@ def function(name: str, value: object, of: str) -> Any:
 
 
 def check_progress(value: object, of: str) -> None:
-    """Raise ValueError unless progress can be reported: by a function, or to nobody."""
+    """Raise ValueError unless `value` can report progress: a function of `of`, or None for no reports."""
     if value is not None:
         function("progress", value, of)
 

@@ -70,7 +70,10 @@ class _CompensatedEvaluation:
     """Evaluation of a traced program in numbers high + low: the rounded value, and what rounding took of it."""
 
     def __init__(self, unit: float):
-        """Choose splitter, type and rules for a precision with rounding `unit`, which is 2^-53 for doubles."""
+        """Choose what depends on the precision of the evaluation, and the rules of operations.
+
+        `unit` is eps of the precision, 2^-52 for doubles. A rule returns a result high + low from arguments high + low.
+        """
         bits = 1 - round(np.log2(unit))  # bits of a number's fraction
         self.splitter = 2.0 ** ((bits + 1) // 2) + 1  # factor that splits a number into halves of its digits
         self.stored = np.float32 if bits <= 24 else np.float64
@@ -102,7 +105,7 @@ class _CompensatedEvaluation:
         return list(map(look_up, jaxpr.outvars))
 
     def _split_known(self, number: Any) -> Compensated:
-        """Split a known real number into what the precision can hold and the rest; anything else has no rest (None)."""
+        """Return a known real number as what the precision can hold and the rest; anything else has no rest (None)."""
         if isinstance(number, jax.core.Tracer) or not np.issubdtype(np.asarray(number).dtype, np.floating):
             return Compensated(number)
         exact = np.asarray(number, np.float64)

@@ -63,7 +63,7 @@ def where(condition: Array, a: Array | float, b: Array | float) -> jax.Array:
     dtype = jnp.result_type(a, b)
 
     def broadcast(x: Array | float, dtype: np.dtype[Any]) -> Array:
-        """Return x as an array of this type and of the common shape."""
+        """Return x as an array of this type, broadcast to the common shape by one operation of JAX, if any."""
         if np.shape(x) == shape and isinstance(x, jax.Array | np.ndarray) and x.dtype == dtype:
             return x
         known = np.asarray(x, dtype) if not isinstance(x, jax.Array) else lax.convert_element_type(x, dtype)
@@ -145,7 +145,11 @@ def compute_pivot_reciprocal_root(pivot: jax.Array, whole: jax.Array, growth: ja
 
 
 def negative_tolerance(like: jax.Array, growth: jax.Array) -> jax.Array:
-    """Return the share of its diagonal entry that a negative pivot may have by rounding, in a singular matrix."""
+    """Return how far below zero a pivot may be by rounding, as a share of its diagonal entry, in a singular matrix.
+
+    `like` has the precision; `growth` is the largest ratio so far of a diagonal entry to its pivot, by which rounding
+    errors are multiplied.
+    """
     eps = float(np.finfo(like.dtype).eps)
     return jnp.maximum(rounding(NEGATIVE_TOLERANCE, like, 1000), 10 * eps * growth)
 
@@ -174,7 +178,10 @@ def psd_solve(a: Float[Array, "n n"], b: Float[Array, "n k"]) -> Float[jax.Array
 
 
 def solver(a: Float[Array, "n n"]) -> Callable[[Array], jax.Array]:
-    """Return the function B -> X of A X = B for one positive semidefinite A, which is factored once for many B."""
+    """Return the function B -> X that solves A X = B for one positive semidefinite A, factored once for many B.
+
+    It is for B (n, k) in the range of A, as `psd_solve` says.
+    """
     lower, scales = factor(jnp.asarray(a))
 
     def solve(b: Array) -> jax.Array:

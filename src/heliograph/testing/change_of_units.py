@@ -177,7 +177,10 @@ def _rescale_noise(law: AbstractNoise, factors: Float[np.ndarray, " n"]) -> Abst
 
 
 def rescale_plant(plant: AnyPlant, units: Units) -> AnyPlant:
-    """Return the plant in other units: of states S x, with inputs U u."""
+    """Return the plant, or the plant at each step, in other units: with states S x and inputs U u.
+
+    S and U are the diagonal matrices of the factors of states and inputs in `units`.
+    """
     rescaled: AnyPlant = at_each_step(lambda step: _rescale_plant(step, units), plant)
     return rescaled
 
@@ -230,7 +233,10 @@ def _rescale_matrix(
 
 
 def rescale_sensor(sensor: AnySensor, units: Units) -> AnySensor:
-    """Return the sensor in other units: it measures R y of states S x."""
+    """Return the sensor, or the sensor at each step, in other units: it measures R y of states S x.
+
+    R and S are the diagonal matrices of the factors of outputs and states in `units`.
+    """
     rescaled: AnySensor = at_each_step(lambda step: _rescale_sensor(step, units), sensor)
     return rescaled
 
@@ -335,7 +341,12 @@ def _rescale_centre(centre: UnconditionalMean | None, units: Units) -> Unconditi
 
 
 def _rescale_system(filter: LinearSystemFilter, degree: int, units: Units) -> LinearSystemFilter:
-    """Return the filter of a linear system with state and measurements in other units: monomials by powers of these."""
+    """Return the filter of a linear system with state and measurements in other units.
+
+    The system's state has the monomials of the plant's state up to a degree, and its output those of what is received:
+    each is multiplied by the product of its factors. With their diagonal matrices Y and Z, the transition A becomes
+    Y A Y^-1, the drift Y b, the output matrix Z C Y^-1, and the covariances Y Q Y and Z R Z.
+    """
     y, z = _scale_monomials(units.states, degree), _scale_monomials(units.received, degree)
     s = filter.steps.values
     if s.transition.shape[-1] != len(y):  # monomials and 1, mode after mode, behind links that remember
@@ -354,6 +365,11 @@ def _rescale_system(filter: LinearSystemFilter, degree: int, units: Units) -> Li
 
 
 def _scale_monomials(factors: Float[np.ndarray, " n"], degree: int) -> Float[np.ndarray, " N"]:
-    """Return the factors (N,) of monomials up to `degree` of numbers with these factors, without the constant 1."""
-    table = np.array(list_exponents(len(factors) + 1, degree))[:-1, :-1]
-    return np.asarray(np.prod(factors**table, axis=1))
+    """Return the factors (N,) of monomials up to `degree` of numbers with these factors, without the constant 1.
+
+    The monomial x^a y^b of numbers with the factors s and t has the factor s^a t^b.
+    """
+    # Exponents of all products of `degree` of the numbers (x, 1), a row for each; the last column is that of the 1, and
+    # the last row that of the product of ones.
+    exponents = np.array(list_exponents(len(factors) + 1, degree))[:-1, :-1]
+    return np.asarray(np.prod(factors**exponents, axis=1))

@@ -173,7 +173,10 @@ def _draw_twice(channel: AbstractRandomAffine, seed: int, samples: int) -> tuple
 
 
 def _evaluate_monomials(z: np.ndarray, order: int) -> np.ndarray:
-    """Return the monomials of this order in (z, 1) for each row of z (samples, outputs), as (samples, monomials)."""
+    """Return all products of `order` of the numbers (z, 1), for each sample of z (samples, outputs).
+
+    They are columns (samples, monomials), in the order of `list_exponents`: the exponents of z's entries and of the 1.
+    """
     values = np.column_stack([z, np.ones(len(z))])
     columns = np.arange(values.shape[1])
     powers = list_exponents(len(columns), order)

@@ -35,7 +35,7 @@ def vector_type(type: Type) -> str:
 
 
 def write_literal(value: float | int | bool, type: Type) -> str:
-    """Return the LLVM text of a constant; LLVM writes a real one, even a float, by its bits as a double."""
+    """Return the LLVM text of a constant number; LLVM writes a real one, even a float, by its bits as a double."""
     if type in REAL:
         return "0x" + struct.pack(">d", float(value)).hex().upper()
     if type == "bool":

@@ -23,7 +23,7 @@ class TextLines:
         self.count = 0
 
     def add(self, text: str) -> str:
-        """Append an operation in LLVM's text; return the new name of its result."""
+        """Append an instruction, given without its result as in "add i64 %a, 1"; return the new name of its result."""
         self.count += 1
         self.lines.append(f"  %x{self.count} = {text}")
         return f"%x{self.count}"

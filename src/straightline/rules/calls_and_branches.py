@@ -21,7 +21,10 @@ CALLS = (
 
 
 def _inline_call(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """Return the results of a call (jit, custom_jvp, ...): the program of its function is written in its place."""
+    """Return the results of a call of JAX (jit, custom_jvp, ...): its function's program is written in its place.
+
+    So the native program has no calls: the operations of the function are added to it one by one (`lowering`).
+    """
     params = equation.params
     # Each kind of call has its own name for the program.
     inner = next(params[name] for name in ("jaxpr", "call_jaxpr", "fun_jaxpr") if name in params)
@@ -182,7 +185,10 @@ def _move_statements_out(block: Block, outer: Block) -> None:
 
 
 def _select_arrays(lowering: Lowering, condition: Node, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return array a where the condition, one for all entries, holds, else b."""
+    """Return the nodes that select array a where the condition, one flag for all entries, holds, else array b.
+
+    Data decide the condition, so that each entry becomes a selection, an operation of the program.
+    """
     pairs = zip(a.ravel().tolist(), b.ravel().tolist(), strict=True)
     return arrange_nodes([select(lowering.graph, condition, x, y) for x, y in pairs], a.shape)
 

@@ -155,7 +155,7 @@ def _differentiate(primals: Sequence[Any], tangents: Sequence[Any], **params: An
     has_tangent = [not isinstance(tangent, ad.Zero) for tangent in tangents]
 
     def call(*varying: Any) -> list[Any]:
-        """Call the plain function with these in place of the arguments that have tangents."""
+        """Return the plain function's results with `varying` in place of the arguments that have tangents."""
         rest = iter(varying)
         return _apply_plain(*(next(rest) if has else x for has, x in zip(has_tangent, primals, strict=True)), **params)
 
@@ -203,7 +203,7 @@ def _apply_one_by_one(function: Callable[..., list[Any]], axes: Axes, *leaves: A
     """
 
     def call(entries: list[Any]) -> list[Any]:
-        """Call the function for one entry of each leaf that has a batch."""
+        """Return the function's results for one entry of each leaf with a batch, and the other leaves as they are."""
         rest = iter(entries)
         return function(*(x if axis is None else next(rest) for x, axis in zip(leaves, axes, strict=True)))
 

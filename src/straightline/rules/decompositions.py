@@ -80,7 +80,11 @@ def _choose_power_of_two_unit(a: jax.Array) -> jax.Array:
 def _make_tournament_turn(
     n: int,
 ) -> tuple[int, Callable[[tuple[Numbers, Numbers], None], tuple[tuple[Numbers, Numbers], None]]]:
-    """Return the count of turns of a sweep, and one turn: A <- J' A J, V <- V J for pairs (p, q), then rows move on."""
+    """Return how many turns a sweep of Jacobi's method has, and the function of one turn.
+
+    A turn rotates disjoint pairs (p, q) of rows at fixed places, A <- J' A J and V <- V J with a rotation J for each,
+    and then moves the rows on to other places. After all turns each row has met each other row once, and is back.
+    """
     # As in a tournament of n players: place k plays place turns - k, all players but the last move on by one place
     # between turns, and the last one plays whoever is at place 0. With n odd there is no last one, and place 0 pauses.
     turns = n - 1 + n % 2

@@ -26,7 +26,7 @@ WORDS: dict[Type, tuple[Type, Type]] = {"f64": ("u64", "i64"), "f32": ("u32", "i
 
 
 def broadcast_entries(arrays: Sequence[np.ndarray], shape: tuple[int, ...]) -> list[list[Any]]:
-    """Return a list of entries for each array, broadcast to `shape` and in row-major order."""
+    """Return for each array of nodes the list of its entries, broadcast to `shape`, in row-major order."""
     size = math.prod(shape)
     return [
         [a.item()] * size if a.size == 1 else (a if a.shape == shape else np.broadcast_to(a, shape)).ravel().tolist()

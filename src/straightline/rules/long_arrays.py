@@ -74,7 +74,11 @@ def _are_written_out(inputs: list[Value], count: int) -> bool:
 
 
 def _make_row_by_row_rule(name: str) -> Rule:
-    """Return the rule of an elementwise operation: of short arrays at once, of long ones row by row in a loop."""
+    """Return the rule of JAX's elementwise operation `name`, for arrays that may be in memory.
+
+    The numbers of short arrays are loaded, and each entry of the result is a scalar operation of its own. Of long
+    arrays the result is computed row by row, in a loop of the program.
+    """
 
     def lower_row_by_row(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
         """Lower an operation of entries (`name`): of long arrays one row of the result after another, in a loop.
@@ -89,7 +93,7 @@ def _make_row_by_row_rule(name: str) -> Rule:
         row_equation = make_row_equation(equation)
 
         def body(row: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
-            """Return no carry, and the operation's result for one row."""
+            """Return no carry, and the operation's result for the row with the number `row`, a node."""
             rows = [take_row_of_argument(lowering, x, row, ndim) for x in items]
             return [], list(lowering.lower_equation(row_equation, rows))
 
@@ -182,7 +186,7 @@ def _multiply_by_row(lowering: Lowering, equation: JaxprEqn, a: StridedArray, b:
     by_row = [(x if axis is None else _move_to_front(x, axis), axis) for x, axis in ((a, a_axis), (b, b_axis))]
 
     def multiply_row(row: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """Return no carry, and the product for one row."""
+        """Return no carry, and the product for one row; `row` is the node of the loop's counter."""
         rows: list[Value] = [x if axis is None else x.row(row) for x, axis in by_row]
         return load_as_nodes(lowering, ([], list(lowering.lower_equation(row_equation, rows))))
 
@@ -227,14 +231,20 @@ def _count_terms(a: np.ndarray, left: int, b: np.ndarray, right: int) -> int:
 
 
 def _count_nonzero_entries(x: np.ndarray, axis: int) -> np.ndarray:
-    """Return for each index along an axis how many of the entries there are not known to be zero."""
+    """Return for each index along an axis how many of the entries there are not known to be zero.
+
+    x is an array of nodes, the program's scalar operations; a constant node of 0 is a known zero.
+    """
     is_data = np.array([n.op != "constant" or bool(n.value) for n in x.ravel().tolist()]).reshape(x.shape)
     counts: np.ndarray = np.moveaxis(is_data, axis, -1).reshape(-1, x.shape[axis]).sum(0)
     return counts
 
 
 def _sum_iterations(lowering: Lowering, equation: JaxprEqn, count: int, body: LoopBody) -> list[Value]:
-    """Return the sum of the numbers that `body` returns to be stacked, over the `count` iterations of a loop."""
+    """Return the sum of the numbers that `body` returns to be stacked, over the `count` iterations of a loop.
+
+    The loop is one of the program that is being written. Its carry is the sum so far, an array of one node.
+    """
     sum_along_first: Any = SimpleNamespace(params={"axes": (0,)}, outvars=equation.outvars)
 
     def add_number(row: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
@@ -310,7 +320,10 @@ def _renumber_axes(axes: Sequence[int], removed: int | None) -> tuple[int, ...]:
 
 
 def _make_reduction_rule(name: str) -> Rule:
-    """Return the rule of a reduction, such as `reduce_sum`: short arrays at once, long ones row by row."""
+    """Return the rule of JAX's reduction `name`, such as `reduce_sum`, for arrays that may be in memory.
+
+    Short arrays are loaded and reduced number by number; long ones are reduced in a loop over their rows.
+    """
 
     def lower_reduction(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
         """Lower the reduction `name` of an array along the operation's axes; a long array is reduced row by row."""
@@ -346,7 +359,7 @@ def _reduce_long(lowering: Lowering, equation: JaxprEqn, name: str, x: Value) ->
         return [], [reduce_row(index)]
 
     def accumulate_row(index: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """Return the rows reduced so far with this one, and nothing to stack."""
+        """Return the reduction of the rows so far and of row `index` as the carry, and nothing to stack."""
         pair = np.stack([carry[0], reduce_row(index)])
         return [np.asarray(RULES[name](lowering, of_two_rows, [pair])[0])], []
 

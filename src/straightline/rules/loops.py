@@ -90,7 +90,7 @@ def _make_carried_nodes(graph: Graph, op: str, loop: Loop, block: Block) -> list
 
 
 def is_symmetric(x: np.ndarray) -> bool:
-    """Return whether matrices (..., n, n) with n > 1 are symmetric: entries (i, j) and (j, i) are the same node."""
+    """Return whether matrices of nodes (..., n, n), n > 1, are symmetric: entries (i, j) and (j, i) are one node."""
     if x.ndim < 2 or x.shape[-1] != x.shape[-2] or not x.size or x.shape[-1] == 1:
         return False
     return all(a is b for a, b in zip(x.ravel().tolist(), np.swapaxes(x, -1, -2).ravel().tolist(), strict=True))
@@ -253,7 +253,7 @@ class CarriedMemory:
         self.memory.kind = "carried"  # memory that each iteration of a loop overwrites, unlike "scratch" memory
 
     def view_in_iteration(self) -> StridedArray:
-        """Return the array as an iteration reads it; the loop's body must be the graph's open block."""
+        """Return the array as an iteration of the loop reads it; the loop's body must be the graph's open block."""
         self.memory.parts = []  # a body may be lowered twice: forget what filled the memory in the first try
         return self.view_from_here()
 
@@ -325,7 +325,10 @@ def _take_row(x: np.ndarray, i: int) -> np.ndarray:
 
 
 def put_in_memory(lowering: Lowering, value: Value) -> StridedArray:
-    """Return an array in memory: constants become a table, and other nodes are stored one by one in a new buffer."""
+    """Return an array in memory, so that data can choose among its entries.
+
+    An array of nodes is stored: constants become a table of the program, others a buffer that the open block fills.
+    """
     if isinstance(value, StridedArray):
         return value
     flat = _list_nodes_of_numbers(value)

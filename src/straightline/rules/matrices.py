@@ -15,7 +15,10 @@ from straightline.nodes import REAL, Node, Type, Unsupported
 
 
 def combine_nodes(graph: Graph, op: str, type: Type, nodes: Sequence[Node], empty: float) -> Node:
-    """Return the node of n_0 op n_1 op n_2 ..., from the left; the constant `empty` if there are no nodes."""
+    """Return the node of n_0 op n_1 op n_2 ..., from the left; the constant `empty` if there are no nodes.
+
+    Nodes are scalar operations of the program that is being written, `graph`; those of this chain are added to it.
+    """
     if not nodes:
         return graph.constant(empty, type)
     return reduce(lambda a, b: graph.node(op, type, a, b), nodes)
@@ -28,7 +31,7 @@ def _make_reduction_rule(op: str, empty: float) -> Rule:
     """
 
     def lower_operation(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-        """Return the array reduced by `op` along the operation's axes; where there are no entries it is `empty`."""
+        """Return an array of nodes reduced by `op` along the operation's axes; of no entries the result is `empty`."""
         axes, shape, type = equation.params["axes"], result_shape(equation), result_type(equation)
         # Make a row of terms for each entry of the result; a reduction of no entries has rows of length 0.
         terms = math.prod(inputs[0].shape[axis] for axis in axes)
@@ -66,7 +69,10 @@ def _make_accumulation_rule(op: str) -> Rule:
     """Return the rule of an operation such as `cumsum`, which accumulates an array along an axis by `op`."""
 
     def lower_operation(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-        """Return the array accumulated by `op` along the operation's axis; in reverse, from its last entry on."""
+        """Return an array of nodes accumulated by `op` along the operation's axis, in reverse from its last entry on.
+
+        Entry k of the result combines entries 0 to k: each is one more scalar operation of the program.
+        """
         axis, type, reverse = equation.params["axis"], result_type(equation), equation.params["reverse"]
         if not inputs[0].size:
             return inputs
@@ -184,7 +190,11 @@ def _is_zero_term(x: Node, y: Node) -> bool:
 
 
 def _is_weighted(a: np.ndarray, b: np.ndarray) -> bool:
-    """Return whether A = B diag(w) for some nodes w: each column of A is the column of B times one node."""
+    """Return whether A = B diag(w) for some nodes w: each column of A is the column of B times one node.
+
+    A and B are arrays of nodes (scalar operations), so that it is seen from the operations whether it holds. Then A B'
+    is B diag(w) B', which is symmetric.
+    """
     if a.shape != b.shape:
         return False
     weights = [[_find_weight(x, y) for x, y in zip(*columns, strict=True)] for columns in zip(a.T, b.T, strict=True)]
@@ -238,7 +248,11 @@ def _as_matrices(x: np.ndarray, contracted: Sequence[int], batch: Sequence[int])
 
 
 def _for_each_matrix(function: Any) -> Rule:
-    """Return the rule that calls function(graph, parameters, *matrices) for each matrix of a stack (..., n, m)."""
+    """Return the rule of an operation on matrices that JAX applies to each matrix of a stack (..., n, m).
+
+    function(graph, parameters, *matrices) returns the result for one matrix of each argument, as nodes of the graph,
+    the scalar operations of the program; `parameters` are those of JAX's operation.
+    """
 
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
         """Return what `function` makes of the matrices, one by one; they lie along each argument's last two axes."""

@@ -27,7 +27,7 @@ def _make_rearranging_rule(function: Callable[[np.ndarray, Any, tuple[int, ...]]
 
 
 def _broadcast_in_dim(x: np.ndarray, params: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """Return an array broadcast to a shape; the array's axis k becomes axis broadcast_dimensions[k] of the result."""
+    """Return an array of nodes broadcast to a shape: its axis k becomes axis broadcast_dimensions[k] of the result."""
     placed = [1] * len(shape)
     for size, axis in zip(x.shape, params["broadcast_dimensions"], strict=True):
         placed[axis] = size
@@ -63,7 +63,11 @@ def _unstack(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -
 
 
 def _lower_pad(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Lower `pad`: return x surrounded by a filling; negative padding cuts entries of x off."""
+    """Return x surrounded by a filling, as JAX's `pad` does; negative padding cuts entries of x off.
+
+    x is an array of nodes (the program's scalar operations), and the filling is one node. `padding_config` has for each
+    axis how many entries come before and after x, and how many between two neighbours.
+    """
     x, filling = inputs
     padded = np.empty(result_shape(equation), dtype=object)
     padded[...] = filling[()]

@@ -283,7 +283,10 @@ def _convert(lowering: Lowering, type: Type, value: Value) -> Value:
 
 @cache
 def _trace_over_arrays(function: Callable[..., Any], count: int, shape: tuple[int, ...]) -> ClosedJaxpr:
-    """Return the program that applies a function of `count` scalars to each entry of `count` arrays, in double."""
+    """Return the program that applies a function of `count` scalars to each entry of `count` arrays of this shape.
+
+    JAX traces it in double precision, by `vmap` over each axis; it is traced once for each shape.
+    """
     over_arrays = function
     for _ in shape:
         over_arrays = jax.vmap(over_arrays)

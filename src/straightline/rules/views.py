@@ -27,7 +27,7 @@ def _make_view_rule(name: str, view: View) -> Rule:
     """
 
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-        """Return the `view` of an array in memory, or if there is none, nodes by the operation's rule `name`."""
+        """Return the view of an array in memory; if there is none, its numbers, loaded as nodes and rearranged."""
         array_view = view(inputs[0], equation.params, result_shape(equation))
         if array_view is not None:
             return [array_view]
@@ -44,7 +44,7 @@ def _slice(x: StridedArray, params: Any, shape: tuple[int, ...]) -> StridedArray
 
 
 def _reverse(x: StridedArray, params: Any, shape: tuple[int, ...]) -> StridedArray:
-    """Return the view of an array in memory that goes backwards along some axes."""
+    """Return the view of an array in memory that goes backwards along the operation's axes; nothing is copied."""
     # Begin at the last entry of each such axis, and go by negative strides.
     axes = params["dimensions"]
     offset = sum(x.strides[a] * (x.shape[a] - 1) for a in axes)
@@ -236,7 +236,7 @@ def join_arrays(lowering: Lowering, parts: list[Value], shape: tuple[int, ...]) 
 
 
 def _is_whole_buffer(x: StridedArray, block: Any) -> bool:
-    """Return whether an array is all of a buffer that this block fills and that lies inside no other buffer."""
+    """Return whether an array is all of a memory (buffer) that this block fills and that is no part of another."""
     buffer = x.buffer
     is_contiguous = not x.moves and x.offset == 0 and x.strides == contiguous_strides(x.shape)
     is_whole = is_contiguous and x.size == buffer.size

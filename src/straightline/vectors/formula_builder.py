@@ -29,7 +29,7 @@ class FormulaBody:
         return f"%{scalar}"
 
     def add(self, scalar: str, operation: str) -> "Vector":
-        """Append an operation in LLVM's text; return its result, a vector of the type `scalar`."""
+        """Append an LLVM instruction, given without its result; return the result, a vector of numbers `scalar`."""
         name = f"%t{len(self.lines)}"
         self.lines.append(f"{name} = {operation}")
         return Vector(self, scalar, name)
@@ -77,7 +77,7 @@ def _make_operator(
 
 
 def _make_comparison(real_condition: str, integer_condition: str) -> Callable[["Vector", Operand], "Vector"]:
-    """Return a method that compares vectors, such as __lt__; reals and integers have different LLVM conditions."""
+    """Return a method that compares vectors, such as __lt__, by LLVM's condition for reals or that for integers."""
 
     def compare(self: "Vector", other: Operand) -> "Vector":
         """Write the comparison of self with other; return its truth values, lane by lane."""

@@ -212,6 +212,6 @@ def describe_clock_set_forward(clock: np.ndarray, row: int) -> str:
 
 
 def backwards_text(clock: np.ndarray, row: int) -> str:
-    """Return the two times of that row and the row above in words."""
+    """Return the time of a row and that of the row before it in words: "3 after 5"."""
     now, before = (f"{t:.10g}" if clock.dtype.kind == "f" else str(t) for t in (clock[row], clock[row - 1]))
     return f"{now} after {before}"

@@ -71,7 +71,10 @@ class _ProgramWriter:
         return " ".join(self._write_value(x.val) if isinstance(x, Literal) else str(numbers[x]) for x in atoms)
 
     def _write_value(self, value: Any) -> str:
-        """Return the text of a parameter of an operation: arrays and inner programs by their hashes."""
+        """Return the text of a parameter of an operation, the same in each process.
+
+        Arrays and inner programs are written as their hashes, a dictionary by sorted keys, functions and types by name.
+        """
         match value:
             case ClosedJaxpr():
                 return self._write_hash(value, value.jaxpr, value.consts)
