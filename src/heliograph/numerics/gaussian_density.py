@@ -63,8 +63,7 @@ def log_density(
     def condition_on_component(j: Any, state: _ConditionedVector) -> _ConditionedVector:
         """Add the log density of component j given those before it, and condition the later components on it.
 
-        `left` is the covariance S of the components given the earlier ones, e their deviations. Component j has the
-        variance s_jj, and takes from component i what it explains: e_i - (s_ij / s_jj) e_j.
+        With the deviations e and covariance S given the earlier ones, e_i becomes e_i - (s_ij / s_jj) e_j.
         """
         e, left = state.value, state.covariance
         pivot = left[j, j]
