@@ -264,7 +264,8 @@ def accumulate(
     """Compile a JAX function of a run's number; return a program that sums its results over runs, or collects them.
 
     A Monte Carlo simulation is such a function: the run's number makes its random key. Sums take no more memory for
-    more runs. The program is called with the arguments and with `runs`; `begin` and `add` compute runs a few at a time.
+    more runs. The program is called with the arguments and with `runs`; what its method `bind_arguments` returns
+    computes runs a few at a time, by `add_runs`.
 
     Args:
         function: of the arguments, which all runs share, and of the number of the run (uint32); it returns a pair, what

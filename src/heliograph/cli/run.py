@@ -285,9 +285,9 @@ def _write_report(name: str, network: "Network", plants: "Sequence[FilteredPlant
     from heliograph.report.results_folder import ResultsContent, write_results
 
     def examine_plant(plant: "FilteredPlant", advance: "Advance") -> Health:
-        """Return the diagnosis of a plant with its forecasts, predictions, residuals, and refusals by node.
+        """Return the diagnosis of a plant's record, completed by its forecasts, predictions and refused messages.
 
-        Residuals are what was not predicted. There are some only if predictions were asked for.
+        Residuals, what was measured less what was predicted, are part of it if predictions were asked for.
         """
         record, inputs = plant.record, plant.data.recording.inputs
         residuals = heliograph.forecasting.record_residuals(record, inputs) if plant.predicted else {}

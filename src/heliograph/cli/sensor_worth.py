@@ -85,7 +85,10 @@ def compute_worth(network: "Network", module: Mapping[str, object], options: Wor
 
 
 def _check_figure_writable(figure: Path) -> None:
-    """Raise the error of writing the figure before the work: no matplotlib, or a wrong format or folder."""
+    """Raise ValueError, or MissingPackagesError, before the work starts if a figure could not be written after it.
+
+    Its format or folder may be wrong, or matplotlib not installed.
+    """
     from heliograph.disk.atomic_files import check_writable
     from heliograph.numerics.process.optional_packages import check_installed
 

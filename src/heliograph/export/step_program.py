@@ -64,7 +64,7 @@ class StepProgram(NamedTuple):
 
     @property
     def operations(self) -> dict[str, int]:
-        """Return the number of each operation in a step."""
+        """Return how often each operation, such as "mul", is in the functions of a step; in a loop it counts once."""
         counts = [code.operations for code in self.computes]
         return {op: sum(count.get(op, 0) for count in counts) for every in counts for op in every}
 

@@ -50,17 +50,26 @@ def error_text(error: Exception) -> str:
 
 
 def array(name: str, value: ArrayLike, shape: tuple[int | str | None, ...], missing: bool = False) -> Any:
-    """Return `value` as a float64 array of the given shape, NaN where it is masked; a traced one keeps its precision.
+    """Return a user's value as a float64 array of the given shape, NaN where it is masked; raise ValueError for others.
 
-    A length in the shape is free if it is None, or a name for errors. Numbers must be real and finite; with `missing`
-    they may be NaN, for a number that did not arrive. Of a traced array only the shape is checked.
+    Numbers must be real and finite. An array that JAX traces, of which the numbers are not known, keeps its precision,
+    and only its shape is checked.
+
+    Args:
+        name: what an error calls the value.
+        value: numbers in any form that NumPy makes an array of.
+        shape: the length of each axis; any length where it is None, or a text, which errors show in its place.
+        missing: whether numbers may be NaN, for what did not arrive.
     """
     report_domain(name, value, REAL)
     return check_numbers(name, _read_numbers(name, value), shape, missing)
 
 
 def check_numbers(name: str, numbers: Any, shape: tuple[int | str | None, ...], missing: bool = False) -> Any:
-    """Return an array of numbers that has the shape, and finite ones as `array` says; not a copy of it."""
+    """Return an array as it is, not a copy, if it has the shape and its numbers are finite; raise ValueError if not.
+
+    The arguments are those of `array`. Of an array that JAX traces only the shape is checked.
+    """
     fixed = [(axis, length) for axis, length in enumerate(shape) if isinstance(length, int)]
     if numbers.ndim != len(shape) or any(numbers.shape[axis] != length for axis, length in fixed):
         raise fail(name, _describe_shape(shape, numbers.ndim), f"shape {numbers.shape}")
@@ -88,9 +97,10 @@ def _describe_shape(shape: tuple[int | str | None, ...], dimensions: int) -> str
 
 
 def check_columns(name: str, table: object, names: Sequence[str] = ()) -> None:
-    """Raise ValueError if a table's names contradict an array's (one twice, another order), or its numbers are packed.
+    """Raise ValueError if a table's columns have a name twice, or the `names` in another order, or packed numbers.
 
-    Only texts count as names. An array, or a table whose columns have numbers, has none.
+    Packed numbers, as files of NetCDF have them, are codes that the reader should have decoded. Only texts count as
+    names: an array, or a table whose columns have numbers, has none.
     """
     if packing := find_packing(table):
         raise fail(name, "decoded numbers, as xarray.decode_cf makes them", f"an array with the attribute {packing!r}")
@@ -105,7 +115,10 @@ def check_columns(name: str, table: object, names: Sequence[str] = ()) -> None:
 
 
 def _read_numbers(name: str, value: ArrayLike) -> Any:
-    """Return real numbers as an array of doubles, traced ones as they are; raise one line of anything else."""
+    """Return a user's real numbers as an array of doubles, or as JAX traces them; raise ValueError for anything else.
+
+    Masked numbers become NaN. Whole numbers and flags that are traced become floats.
+    """
     traced = is_traced(value)
     if not traced:
         check_columns(name, value)

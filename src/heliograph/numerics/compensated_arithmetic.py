@@ -114,9 +114,11 @@ class _CompensatedEvaluation:
         return Compensated(high, low if np.any(low) else None)
 
     def _apply_operation(self, equation: JaxprEqn, inputs: list[Compensated]) -> list[Compensated]:
-        """Return the results of one operation f; without a rule in `self.rules` it is f(high) + f'(high) low.
+        """Return the results of one operation f of a traced program, as numbers high + low.
 
-        A call of a program and a branch are evaluated inside.
+        A number is its rounded value `high` and what rounding took of it, `low`. By a rule of `self.rules`, the result
+        has the rounding error of f too. Without a rule it is f(high) with the low part f'(high) low, to first order. A
+        call of a program and a branch are evaluated operation by operation.
         """
         name, params = equation.primitive.name, equation.params
         program = called_program(equation)

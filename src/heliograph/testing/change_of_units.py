@@ -209,9 +209,10 @@ def _rescale_plant(plant: AbstractPlant, units: Units) -> AbstractPlant:
 
 
 def _rescale_initial_law(plant: AbstractPlant, s: np.ndarray) -> tuple[np.ndarray, AbstractNoise | np.ndarray]:
-    """Return the center and the law (or the covariance) of the initial state S x_0 with S = diag(s).
+    """Return the center, and the law of the deviation from it or its covariance, of the initial state S x_0.
 
-    A law is that of the deviation from the center. The center is the mean minus the deviation's own mean.
+    S is diag(s), s the factors of the states in other units. A plant has a covariance, or a law of the deviation, whose
+    mean may not be zero: so the center is the mean of the state less that of the deviation.
     """
     if plant.deviation is None:
         return s * plant.initial_mean, np.outer(s, s) * plant.initial_covariance
@@ -222,9 +223,13 @@ def _rescale_initial_law(plant: AbstractPlant, s: np.ndarray) -> tuple[np.ndarra
 def _rescale_matrix(
     matrix: MatrixOfInputs | ArrayLike, rows: np.ndarray, columns: np.ndarray, inputs: np.ndarray
 ) -> FunctionInUnits | np.ndarray:
-    """Return the matrix of rows_i A_ij / columns_j, all factors but A; it is a function of the inputs if A is one.
+    """Return a plant's matrix A in other units, with the entries r_i A_ij / c_j; a function of the inputs if A is one.
 
-    `inputs` are the factors by which the inputs are divided before this function is called.
+    Args:
+        matrix: A.
+        rows: factors r of what the matrix returns, such as states.
+        columns: factors c of what it multiplies.
+        inputs: factors of the inputs, by which new ones are divided before the function is called.
     """
     factor = rows[:, None] / columns
     if isinstance(matrix, MatrixOfInputs):

@@ -163,16 +163,19 @@ def _mirror_triangles(upper: np.ndarray, n: int) -> np.ndarray:
 
 
 def _lower_scan(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """Lower `scan`, and return its carry and then what it stacks.
+    """Return the results of JAX's `scan`, its last carry and then what it stacks, as operations of the program.
 
     If all iterations together compute at most `written_out` numbers, they are written out one after another. Else the
-    scan becomes a loop. The arguments are constants, the carry, and arrays of which each iteration gets a row.
+    scan becomes a loop. The arguments are in this order what is the same in all iterations, the carry, and arrays of
+    which each iteration gets a row.
     """
     params = equation.params
-    (consts, carried), length = _count_scan_arguments(params), params["length"]
-    fixed, carry, rows = inputs[:consts], inputs[consts : consts + carried], inputs[consts + carried :]
-    size = length * estimate_size(lowering, params["jaxpr"].jaxpr)
-    if size <= lowering.written_out or length <= 1:  # a loop of one iteration would be no shorter
+    fixed_count, carry_count = _count_scan_arguments(params)
+    fixed, others = inputs[:fixed_count], inputs[fixed_count:]
+    carry, rows = others[:carry_count], others[carry_count:]
+    length = params["length"]
+    computed_numbers = length * estimate_size(lowering, params["jaxpr"].jaxpr)
+    if computed_numbers <= lowering.written_out or length <= 1:  # a loop of one iteration would be no shorter
         return _write_out_scan(lowering, equation, fixed, [lowering.nodes(x) for x in carry], rows)
     return _lower_long_scan(lowering, equation, fixed, carry, rows)
 
@@ -302,7 +305,15 @@ def _count_scan_arguments(params: dict[str, Any]) -> tuple[int, int]:
 def _write_out_scan(
     lowering: Lowering, equation: JaxprEqn, fixed: list[Value], carry: list[Value], rows: list[Value]
 ) -> list[Value]:
-    """Lower a short `scan` as its iterations, one after another; return its carry, then the results that it stacks."""
+    """Return the results of a short `scan`, its carry, then what it stacks, from its iterations one after another.
+
+    Args:
+        lowering: the program to which the operations of each iteration are added.
+        equation: the scan.
+        fixed: arguments that are the same in all iterations.
+        carry: the carry before the first iteration.
+        rows: arrays of which each iteration gets a row.
+    """
     params = equation.params
     stacked: list[list[Value]] = []
     numbers = range(params["length"])

@@ -108,8 +108,9 @@ def _evaluate_upper_fraction(a: jax.Array, x: jax.Array, serves: jax.Array) -> j
         last number of the state is |c d - 1|.
         """
         n, c, d, fraction, _ = state
-        numerator, b = n * (a - n), x + 2 * n + 1 - a
-        c, d = b + numerator / c, 1 / _replace_zero_by_tiny(b + numerator * d)
+        numerator, denominator = n * (a - n), x + 2 * n + 1 - a
+        c = denominator + numerator / c
+        d = 1 / _replace_zero_by_tiny(denominator + numerator * d)
         return ContinuedFraction(n + 1, _replace_zero_by_tiny(c), d, fraction * c * d, jnp.abs(c * d - 1))
 
     def still_changes(state: ContinuedFraction) -> jax.Array:

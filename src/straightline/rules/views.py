@@ -218,14 +218,14 @@ def _concatenate(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
 
 
 def join_arrays(lowering: Lowering, parts: list[Value], shape: tuple[int, ...]) -> StridedArray:
-    """Return the concatenation of arrays along the first axis, in one buffer of this `shape`.
+    """Return the concatenation of arrays along the first axis, in one memory (buffer) of this `shape`.
 
-    An array that has a buffer of its own (`_is_whole_buffer`) is computed into its place directly. All others are
-    copied.
+    An array that is all of a buffer of its own is computed into its place directly: its buffer becomes a part of the
+    new one. All others are copied. At least one of the `parts` is in memory, and tells the type of the numbers.
     """
     graph = lowering.graph
-    type = next(x for x in parts if isinstance(x, StridedArray)).type
-    buffer, start = Buffer("scratch", type, shape, graph.current), 0
+    number_type = next(x for x in parts if isinstance(x, StridedArray)).type
+    buffer, start = Buffer("scratch", number_type, shape, graph.current), 0
     for x in parts:
         if isinstance(x, StridedArray) and _is_whole_buffer(x, graph.current):
             buffer.place_buffer_inside(x.buffer, start)

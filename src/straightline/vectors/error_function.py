@@ -91,7 +91,9 @@ def erfc(x: Vector) -> Vector:
     """
     size = abs(x)
     centre, middle, tail = _evaluate_ranges(size)
+    # Near 0, 1 - (x + x centre); above 1/4, where 1 - x rounds, written about 1/2.
     inner = select(x < 0.25, 1 - fma(x, centre, x), 0.5 - (x - 0.5 + x * centre))
+    # Further out, erfc x of positive x, and 2 - erfc(-x) of negative ones; from 28 or -6 on they are 0 and 2.
     positive = select(size < 1.25, (1 - AT_ONE) - middle, select(size >= 28.0, 0.0, tail))
     negative = select(size < 1.25, 1 + (AT_ONE + middle), 2 - tail)
     negative = select(size >= 6.0, 2.0, negative)

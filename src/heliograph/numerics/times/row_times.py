@@ -78,7 +78,7 @@ def read_dates(name: str, value: object) -> np.ndarray | None:
     """
     if is_traced(value):
         return None
-    if getattr(getattr(value, "dtype", None), "kind", "") == "M":
+    if getattr(getattr(value, "dtype", None), "kind", "") == "M":  # datetime64, or a type of pandas with a zone
         filled = fill_masked(value) if isinstance(value, np.ma.MaskedArray) else value
         dates = np.asarray(filled)
         return _convert_to_nanoseconds(name, dates if dates.dtype.kind == "M" else np.asarray(filled, NANOSECONDS))

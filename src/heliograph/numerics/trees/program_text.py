@@ -28,9 +28,10 @@ def hash_numbers(numbers: PyTree) -> str:
 
 
 def write_program_text(program: ClosedJaxpr) -> str:
-    """Return operations, parameters and constants, a line for each operation; inner programs by their hash.
+    """Return a program that JAX traced as text: its constants and a line for each operation, inner programs by hashes.
 
-    A lowered program says the same, and takes as long to write as half of the trace.
+    The same function gives the same text in each process, so that a compiled program is found again by it. JAX's own
+    text of the lowered program says the same, but takes half as long to write as the trace.
     """
     return _ProgramWriter().write_program(program.jaxpr, program.consts)
 
