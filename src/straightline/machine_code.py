@@ -80,7 +80,7 @@ def choose_hasty_width(width: int) -> int:
 
 @cache
 def get_careful_thread() -> ThreadPoolExecutor:
-    """Return the one thread that generates optimised code, while calls execute the code that was quickly made.
+    """Return the executor with the one thread that generates optimised code, while calls execute the first code.
 
     All programs share it, so that optimised code is generated for one program after another.
     """

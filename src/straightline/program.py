@@ -144,7 +144,7 @@ def needs_arguments_alone(node: Any) -> bool:
 
 
 def _list_needs(node: Any) -> list[Any]:
-    """Return what a node or a statement needs: its arguments, memory, and the loop or guard around it.
+    """Return what an item of a program needs, directly: its arguments, memory, and the loop or guard around it.
 
     A buffer needs the statements that fill it, its parts, and the buffer that it lies in.
     """

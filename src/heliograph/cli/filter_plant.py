@@ -124,7 +124,12 @@ def filter_rows(
 ) -> tuple["Record", list[str]]:
     """Return the record of the filtered rows, and the warnings that were given meanwhile as lines.
 
-    `after` is the record of the earlier rows, None if there are none.
+    Args:
+        network: the network, whose filters are run.
+        recording: the rows.
+        smooth: how to smooth the estimates; None for not.
+        after: the record of the earlier rows of the same recording, from whose end the filters go on; None if the rows
+            are the first.
     """
     with warnings.catch_warnings(record=True) as doubts:
         warnings.simplefilter("always", UserWarning)

@@ -189,7 +189,11 @@ def _describe_results(record: "Record", out: Path | StoreAddress | None, report:
 
 
 def _describe_estimation_errors(record: "Record") -> list[str]:
-    """Return a line on the errors of each filter, if the truth is known: RMSE by state, and NEES (1: claim holds)."""
+    """Return a line on the errors of each filter, if the true states are known; else no line.
+
+    It has the root mean square error of each state, and the normalised error squared (NEES) per state, which is 1 if
+    the covariance that the filter claims is that of its errors.
+    """
     from heliograph.report.diagnosis.sensor_output_health import compute_filter_errors, round_to
 
     lines = []
@@ -257,7 +261,10 @@ def _refuse_losing_files(
 def _refuse_replacing_inputs(
     measurements: Path | StoreAddress, out: Path | StoreAddress | None, network: "Network", sources: object
 ) -> None:
-    """Raise ValueError if estimates would replace one of the files that are read from a folder of measurements."""
+    """Raise ValueError if estimates would replace one of the files that are read from a folder of measurements.
+
+    `sources`, of the network's file, say which files of the folder are read; None if it has none.
+    """
     from heliograph.files.messages.folder_of_message_files import is_message_folder, list_used_files
     from heliograph.files.sources.topic_reader import TopicReader
     from heliograph.numerics.check import fail
