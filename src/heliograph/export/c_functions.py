@@ -1,8 +1,7 @@
 """Text of the functions of an exported step: whole, or its prediction, its correction and a start apart."""
 
 from heliograph.export.step_parts import PartOfStep
-from heliograph.export.step_program import Real, StepProgram
-from straightline.c_function import CFunction
+from heliograph.export.step_program import CFunction, Real, StepProgram
 
 
 def list_signatures(program: StepProgram, prefix: str, real: Real) -> list[str]:

@@ -13,12 +13,11 @@ from heliograph.export.c_functions import (
 )
 from heliograph.export.late_measurement_window import WindowText, generate_window_code
 from heliograph.export.single_precision_notes import explain_ranges, explain_rounding
-from heliograph.export.step_program import Real, StepProgram
+from heliograph.export.step_program import CFunction, Real, StepProgram
 from heliograph.export.struct_layout import lay_out_array, lay_out_struct
 from heliograph.filters.base import AbstractFilter
 from heliograph.model.estimate import Claim
 from heliograph.model.over_time import first
-from straightline.c_function import CFunction
 
 MEANING: dict[Claim, str] = {
     "exact": "the covariance is E[(x - mean)(x - mean)']",
@@ -147,7 +146,8 @@ def _generate_header(program: StepProgram, form: CTextOptions, fields: Sequence[
 
 def _generate_static_function(code: CFunction) -> str:
     """Return the text of a function of C as one that only its file knows ("static")."""
-    return code.definition.replace(f"void {code.name}(", f"static void {code.name}(", 1)
+    definition: str = code.definition
+    return definition.replace(f"void {code.name}(", f"static void {code.name}(", 1)
 
 
 def _declare_counter(program: StepProgram) -> list[str]:

@@ -1,7 +1,7 @@
 """One step of a filter as functions of C: from state, measurement and inputs to the state after, and to flags."""
 
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -15,9 +15,11 @@ from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import InputError, fail
 from heliograph.numerics.types import PyTree
 from straightline import Unsupported, to_c
-from straightline.c_function import CFunction
 
 Real = Literal["double", "float"]
+# What `straightline.to_c` returns: name and text (`definition`) of a function of C, what it reads (`arguments`) and
+# writes (`results`), and how often it has each operation.
+CFunction: TypeAlias = Any
 RESERVED = frozenset((
     "auto", "break", "case", "char", "const", "continue", "default", "do", "double", "else", "enum", "extern", "float",
     "for", "goto", "if", "inline", "int", "long", "register", "restrict", "return", "short", "signed", "sizeof",
