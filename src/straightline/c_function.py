@@ -39,12 +39,12 @@ class CArray(NamedTuple):
 
     @property
     def argument_declaration(self) -> str:
-        """Return the declaration as what a function reads."""
+        """Return the C declaration of the array, or number, as an argument that a function reads."""
         return f"const {self.type} {self.name}[{max(self.size, 1)}]" if self.is_array else f"{self.type} {self.name}"
 
     @property
     def result_declaration(self) -> str:
-        """Return the declaration as what a function writes."""
+        """Return the C declaration of the array as a result that a function writes."""
         return f"{self.type} {self.name}[{max(self.size, 1)}]"
 
 
@@ -153,18 +153,18 @@ def _describe_arguments(names: Sequence[str], buffers: Sequence[Buffer], real: R
 
 
 def _check_name(name: str) -> None:
-    """Raise ValueError for a name that C does not take for a function."""
+    """Raise ValueError for a name that C does not take for a function: RESERVED has C's words, "_" begins its own."""
     if not (name.isascii() and name.isidentifier()) or name in RESERVED or name.startswith("_"):
         raise ValueError(f"name: expected one that C takes for a function, got {name!r}")
 
 
 def _name_stored_type(type: Type, real: Real) -> str:
-    """Return the type in which a number is stored: a flag is a byte."""
+    """Return the C type in which arguments and results store a number: a flag is a byte, an int when computed with."""
     return "unsigned char" if type == "bool" else c_type(type, real)
 
 
 def _make_entry_expression(array: CArray) -> EntryText:
-    """Return the function from an index to the C expression of an argument's number there."""
+    """Return the function that writes an argument's entry in C: "x[3]" of an index, or "x" where it is one number."""
     return (lambda index: f"{array.name}[{index}]") if array.is_array else (lambda index: array.name)
 
 
@@ -193,7 +193,15 @@ def _declare_function(name: str, arguments: Sequence[CArray], results: Sequence[
 def _describe_results(
     names: Sequence[str], program: ClosedJaxpr, outputs: Sequence[np.ndarray], flat: Sequence[list[Node]], real: Real
 ) -> list[CArray]:
-    """Describe the arrays that a C function writes: name, type, length, whether symmetric, and which are the same."""
+    """Return the description of each array that a C function writes, its results.
+
+    Args:
+        names: their names in C.
+        program: the traced function, which has their types.
+        outputs: arrays of nodes, the scalar operations that compute them.
+        flat: the nodes of each as a list; results of the same nodes are always equal, which `same` says.
+        real: C type of real numbers.
+    """
     results = []
     for n, (name, variable, value, nodes) in enumerate(zip(names, program.jaxpr.outvars, outputs, flat, strict=True)):
         aval: Any = variable.aval
@@ -223,13 +231,21 @@ def _is_symmetric(value: np.ndarray) -> bool:
 def _name_arrays(
     function: Callable[..., PyTree], examples: Sequence[PyTree], tree: Any, names: tuple[Sequence[str], Sequence[str]]
 ) -> tuple[list[str], list[str]]:
-    """Return the names of the arguments' and of the results' arrays, no two the same.
+    """Return the names in C of the arguments' arrays and of the results' arrays, no two the same.
 
-    Where `names` has none: those of parameters and fields. A name that C has, or that is taken, gets underscores.
+    A name that is a word of C, or that is taken, gets underscores.
+
+    Args:
+        function: the function of JAX, whose parameters name the arguments.
+        examples: its arguments, trees of arrays, whose fields name the arrays within.
+        tree: the structure of its results.
+        names: names that the caller chose, of the arguments' arrays and of the results'; an empty sequence for those
+            that are to be made of parameters and fields.
     """
-    argument_names, result_names = list(names[0]), list(names[1])
+    argument_names, result_names = map(list, names)
     if not argument_names:
         parameters = [p.name for p in inspect.signature(function).parameters.values() if p.kind != p.VAR_POSITIONAL]
+        # Arguments that a parameter such as `*rest` takes have no name of their own: they are numbered.
         labels = [parameters[n] if n < len(parameters) else f"argument_{n}" for n in range(len(examples))]
         argument_names = [n for label, x in zip(labels, examples, strict=True) for n in _name_leaves(label, x)]
     if not result_names:
@@ -258,7 +274,7 @@ def _name_leaves(label: str, tree: PyTree) -> list[str]:
 
 
 def _find_code_line(operation: str, equations: Sequence[Any]) -> str:
-    """Return the line of an operation of the graph."""
+    """Return the line of code, as file:number, of the first of JAX's operations (`equations`) with this name."""
     same = (e for e in equations if e.primitive.name.removesuffix("_convert_type") == operation)
     return next((code_line(e) for e in same), "an unknown line")
 

@@ -33,7 +33,7 @@ class ZeroFoldingGraph(Graph):
     """
 
     def __init__(self) -> None:
-        """Make an empty graph, in which nothing is known to be finite yet: neither an input nor a number."""
+        """Make an empty program, in which no input and no number is known to be finite yet."""
         super().__init__()
         # What is finite for certain: 0 times such a number is 0, and needs no operation.
         self.finite_buffers: set[Buffer] = set()  # inputs that hold no NaN
@@ -74,7 +74,7 @@ class CLowering(Lowering):
     """Lowering into a `ZeroFoldingGraph`: written out, with known arrays as tables that a step can index."""
 
     def __init__(self) -> None:
-        """Make a lowering into an empty `ZeroFoldingGraph`, which drops products of zero with finite numbers."""
+        """Begin a program of scalar operations in which 0 times a number that is known to be finite is 0."""
         super().__init__()
         self.graph: ZeroFoldingGraph = ZeroFoldingGraph()
 

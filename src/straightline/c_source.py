@@ -55,7 +55,7 @@ UNSIGNED: dict[str, Callable[..., str]] = {
 
 
 def c_type(type: Type, real: Real) -> str:
-    """Return the C type of a number in the program.
+    """Return the C type of a number of this type in the program, such as int32_t for "i32"; a flag is an int.
 
     `real` is the C type in which numbers of double precision are computed: "double" or "float".
     """
@@ -171,16 +171,18 @@ def _write_conversion(source: Type, target: Type, name: str, real: Real) -> str:
     """
     if target == "bool":
         return f"({name} != 0)"
-    kind = c_type(target, real)
+    target_in_c = c_type(target, real)
     if source not in REAL or target in REAL:
-        return f"({kind}){name}"
-    # A real number as an integer: the type's limits where the number is beyond them (from `end` on, up to -`end`).
+        return f"({target_in_c}){name}"
+    # A real number x as an integer of b bits: the greatest integer for x >= end, the least for x <= low_end. The end is
+    # 2^(b - 1), or without a sign 2^b; the least integer is -end, which is in range itself, or 0.
     bits, is_signed = int(target[1:]), target[0] == "i"
-    limits = kind[:-2].upper()  # int32_t -> INT32
-    end = f"{2.0 ** (bits - is_signed):.1f}{'f' if c_type(source, real) == 'float' else ''}"
+    limits = target_in_c.removesuffix("_t").upper()  # int32_t -> INT32, of the macros INT32_MIN and INT32_MAX
+    suffix = "f" if c_type(source, real) == "float" else ""
+    end = f"{2.0 ** (bits - is_signed):.1f}{suffix}"
     least, low_end = (f"{limits}_MIN", f"-{end}") if is_signed else ("0", "0")
     too_low = f"islessequal({name}, {low_end})"
-    in_range = f"{name} == {name} ? ({kind}){name} : 0"
+    in_range = f"{name} == {name} ? ({target_in_c}){name} : 0"  # NaN does not equal itself
     return f"(isgreaterequal({name}, {end}) ? {limits}_MAX : {too_low} ? {least} : {in_range})"
 
 
@@ -201,12 +203,7 @@ EntryText = Callable[[str], str]  # from an index to what stands there
 
 
 class CSource:
-    """Writer of statements that compute some nodes, and of the tables that they read.
-
-    `entry_texts`: for each input a function from an index to the expression of the number there. `prefix`: of the names
-    of tables. `needed`: what the statements compute; `names`: the variable of each node; `arrays`: the array of each
-    buffer; `tables`: (name, definition) by the numbers in them; `operations`: how many of each were written.
-    """
+    """Writer of the C statements that compute some nodes (scalar operations), and of the tables that they read."""
 
     def __init__(self, roots: Iterable[Node], entry_texts: Mapping[Buffer, EntryText], real: Real, prefix: str):
         """Begin a source without statements.
@@ -224,7 +221,7 @@ class CSource:
         self.count = 0  # how many variables there are
 
     def name_node(self, node: Node) -> str:
-        """Return the variable or literal of a number."""
+        """Return the C text of a node's number: a literal if it is known, else the variable that holds it."""
         return write_literal(node.value, node.type, self.real) if node.op == "constant" else self.names[node]
 
     def _clip_to_range(self, node: Node) -> str:
@@ -262,16 +259,16 @@ class CSource:
         return lines
 
     def declarations(self, indent: str = "    ") -> list[str]:
-        """Return the declarations of the arrays that the statements fill."""
+        """Return the declarations, in C, of the local arrays that the statements fill."""
         arrays = self.arrays.items()
         return [f"{indent}{c_type(b.type, self.real)} {name}[{max(b.size, 1)}];" for b, name in arrays]
 
     def table_definitions(self) -> list[str]:
-        """Return the definitions of the tables."""
+        """Return the definitions, in C, of the constant arrays (tables) that the statements read."""
         return [text for _, text in self.tables.values()]
 
     def _new_name(self) -> str:
-        """Return the name of a new variable."""
+        """Return the name of a new variable of C: v1, v2, ..."""
         self.count += 1
         return f"v{self.count}"
 
@@ -388,7 +385,7 @@ class CSource:
 
 
 def _wrap_numbers(numbers: Sequence[str]) -> list[str]:
-    """Return the texts of numbers, each with a comma, as indented lines of at most WIDTH characters."""
+    """Return the texts of numbers as lines of C: each followed by a comma, at most WIDTH characters a line."""
     lines, line = [], "   "
     for number in numbers:
         if len(line) + len(number) + 2 > WIDTH:

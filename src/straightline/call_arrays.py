@@ -49,6 +49,9 @@ class MemoryOfCall(NamedTuple):
     runs: int
 
     def compute(self, begin: int, end: int, scratch: int) -> None:
-        """Compute blocks `begin` to `end` of runs in this thread, with `scratch` bytes of its own."""
+        """Compute blocks of runs in this thread, from number `begin` up to but without `end`.
+
+        A block is as many runs as a vector has lanes. The thread has `scratch` bytes of memory for its own numbers.
+        """
         memory = allocate_aligned(scratch)
         self.machine.run(self.pointers.ctypes.data, memory.ctypes.data, begin, end, self.runs)

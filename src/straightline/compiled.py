@@ -46,8 +46,8 @@ class CompiledFunction:
         self.code: ModuleText = write_module(program, self.differs, width, fuse=fuses, alone=is_one_run)
         self.width, self.common = self.code.width, self.code.common
         self.operations, self.divisions = self.code.operations, self.code.divisions
-        # Code for blocks of runs, for what all runs share (if anything), and for one run alone. Pairs: runs of a vector
-        # in quickly made code and in optimised code.
+        # Code for blocks of runs, for what all share (if anything), and for one run. Pairs: runs of a vector in quickly
+        # made and in optimised code.
         self.blocks = TieredCode(self.code.blocks, (width or choose_hasty_width(self.width), self.width))
         self.once = None if self.code.once is None else TieredCode(self.code.once, (1, 1))
         self.single = TieredCode(self.code.blocks, (1, 1))
@@ -77,7 +77,7 @@ class CompiledFunction:
         return InPlaceCode(self, runs, inputs)
 
     def generate_code(self, arrays: Sequence[Any] = ()) -> str:
-        """Generate machine code for a first call of these arrays; return why LLVM makes none, "" if it makes code."""
+        """Generate machine code for a first call with these arrays; return "", or why LLVM makes no code."""
         if self._refusal is None:  # not tried yet
             runs = self._count_runs(arrays)
             try:
@@ -160,20 +160,20 @@ class CompiledFunction:
         if shared is None:
             shared = allocate_aligned(self.code.shared)
             pointers = self._list_addresses(arrays, outputs, shared)
-            self.once.choose_machine(1).run(pointers.ctypes.data, 0, 0, 1, 1)  # no scratch; block 0 to 1, of one run
+            self.once.choose_machine(1).run(pointers.ctypes.data, 0, 0, 1, 1)  # no scratch; blocks 0 to 1, of 1 run
             self._shared = shared if all(self.differs[len(self._first) :]) else None
         self._copy_shared_outputs(outputs, shared)
         return shared
 
     def _list_addresses(self, arrays: list[np.ndarray], outputs: list[np.ndarray], shared: np.ndarray) -> np.ndarray:
-        """Return addresses in the order that the code expects: inputs, tables, outputs, what runs share."""
+        """Return addresses as the code expects them: of inputs, tables, outputs, and the memory that runs share."""
         own = list_addresses(arrays[len(self._first) :])
         return np.array([*self._addresses, *own, *self._tables, *list_addresses([*outputs, shared])], dtype=np.uint64)
 
     def _compute_blocks(self, call: MemoryOfCall, cores: int | None) -> None:
-        """Compute all blocks (runs of one vector) of a call: in this thread if that is little work, else in several."""
+        """Compute all blocks (runs of one vector) of a call, in this thread, or in several if that is much work."""
         blocks, scratch = divide_rounded_up(call.runs, call.machine.width), self.code.scratch
-        # Blocks that a thread computes at a time: an even share, but no less than is worth a thread.
+        # Blocks that a thread computes at a time: an even share, SHARES a core, but at least LITTLE operations.
         even_share = divide_rounded_up(blocks, (cores or cpu_count()) * SHARES)
         share = max(even_share, divide_rounded_up(LITTLE, max(self.code.blocks.work, 1)))
         if cores == 1 or share >= blocks:
@@ -193,12 +193,14 @@ class CompiledFunction:
 class InPlaceCode:
     """Code of a `CompiledFunction` for so many runs, in arrays of its own: a call computes `outputs` from `inputs`.
 
-    What all runs share, but the first arguments, which calls leave out, is computed in every call. Bits are those of
-    any number of runs.
+    What follows from shared arguments of calls is computed in every call. Bits are those of any number of runs.
     """
 
     def __init__(self, compiled: CompiledFunction, runs: int, inputs: Mapping[int, np.ndarray]):
-        """Make the arrays of calls; `inputs` has those that are read in place, by the number of the argument."""
+        """Make the arrays of calls for `runs` runs, and choose how a call computes them.
+
+        `inputs`: arrays that are read in place, by the argument's number behind the bound ones (`compiled._first`).
+        """
         code, left_out, self.runs = compiled.code, len(compiled._first), runs
         self._compiled, differs = compiled, compiled.differs[left_out:]
         self.inputs = self._make_inputs(inputs)
@@ -208,7 +210,7 @@ class InPlaceCode:
         self._pointers = np.array(list_addresses(self._memory), dtype=np.uint64)
         self._scratch, self._is_common = allocate_aligned(code.scratch), all(code.common)
         self._addresses = self._pointers.ctypes.data, self._scratch.ctypes.data
-        # The code for so many runs, and whether a call is so little work that threads would cost more than they save.
+        # The code, and whether a call is so little work that threads would cost more than they save.
         self._code_of_runs, width = compiled._choose_code_and_width(runs)
         self._blocks = divide_rounded_up(runs, width)
         self._needs_one_thread = runs == 1 or self._blocks * code.blocks.work < LITTLE
@@ -253,8 +255,8 @@ class InPlaceCode:
             self._compiled._compute_blocks(call, cores=None)
 
     def _compute_shared(self, once: TieredCode) -> None:
-        """Compute what all runs share, and copy the shared results to every run's."""
-        once.choose_machine(1).run(self._addresses[0], 0, 0, 1, 1)
+        """Compute what all runs share by the code `once`, and copy the shared results to every run's row."""
+        once.choose_machine(1).run(self._addresses[0], 0, 0, 1, 1)  # no scratch; blocks 0 to 1, of 1 run
         self._compiled._copy_shared_outputs(self.outputs, self._memory[-1])
 
 
@@ -283,7 +285,10 @@ class SingleRunCode:
         return new
 
     def _allocate_memory(self, first: Sequence[np.ndarray]) -> None:
-        """Allocate the arrays of calls; results in `_in_place` (result: argument) share their argument's array."""
+        """Allocate the arrays of calls: arguments, of which `first` are known, and results.
+
+        A result in `_in_place`, which maps results to arguments, is written over its argument: it is the same array.
+        """
         given = zip(first, self._arguments, strict=False)
         self.inputs = [np.ascontiguousarray(x, type).reshape(shape) for x, (shape, type) in given]
         self.inputs += [np.zeros(shape, type) for shape, type in self._arguments[len(first) :]]
@@ -295,9 +300,9 @@ class SingleRunCode:
         self._call = self.machine.run, self.pointers.ctypes.data, self.scratch.ctypes.data
 
     def __call__(self) -> None:
-        """Compute `outputs` from `inputs`."""
+        """Compute the arrays `outputs` from the arrays `inputs`, by the machine code."""
         run, pointers, scratch = self._call
-        run(pointers, scratch, 0, 1, 1)
+        run(pointers, scratch, 0, 1, 1)  # blocks 0 to 1, that is one, of 1 run
 
 
 def compile(

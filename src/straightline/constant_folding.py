@@ -46,12 +46,12 @@ def wrap_integer(number: int, like: Any) -> Any:
 
 
 def _shift_left(a: Any, b: Any) -> Any:
-    """Return a << b; 0 where b is no number of bits of the type."""
+    """Return the integer a << b in the type of a; 0 where b is negative or at least the type's number of bits."""
     return wrap_integer(int(a) << int(b), a) if 0 <= b < 8 * a.itemsize else a * 0
 
 
 def _shift_right(a: Any, b: Any) -> Any:
-    """Return a >> b with zeros from the left; 0 where b is no number of bits of the type."""
+    """Return the integer a >> b with zeros from the left; 0 where b is negative or at least the type's bits."""
     bits = 8 * a.itemsize
     return wrap_integer(int(a) % (1 << bits) >> int(b), a) if 0 <= b < bits else a * 0
 
@@ -101,12 +101,12 @@ def _minimum(a: Any, b: Any) -> Any:
 
 
 def _sign(a: Any) -> Any:
-    """Return 1 or -1 by the sign; a zero as it is."""
+    """Return 1 or -1 by the sign of a number; a zero, of either sign, as it is."""
     return a if a == 0 else np.sign(a)
 
 
 def _round_away(a: Any) -> Any:
-    """Return the nearest whole number, of halves the one further from zero."""
+    """Return the whole number nearest to a, as a real number; of halves the one further from zero."""
     whole = np.trunc(a)
     return whole + np.copysign(1.0, a) if np.abs(a - whole) >= 0.5 else whole
 
@@ -169,7 +169,7 @@ OF_DOUBLES: dict[str, Callable[[float, float], float]] = {
 
 
 def _evaluate(graph: NodeMaker, op: str, type: Type, args: tuple[Node, ...]) -> Node | None:
-    """Return the constant that an operation on constants gives, or None for one that is not folded."""
+    """Return the node of the constant that an operation on constant nodes gives; None if it is left to the run."""
     if type == "f64" and op in OF_DOUBLES:
         return graph.constant(OF_DOUBLES[op](float(args[0].value), float(args[1].value)), type)
     numbers = [DTYPES[a.type](a.value) for a in args]
@@ -188,7 +188,7 @@ def _evaluate(graph: NodeMaker, op: str, type: Type, args: tuple[Node, ...]) -> 
 
 
 def _is_zero(node: Node) -> bool:
-    """Return whether a node is the constant 0."""
+    """Return whether a node (an operation of the program) is the constant 0."""
     return bool(node.op == "constant" and node.value == 0)
 
 
@@ -230,7 +230,10 @@ def _fold_sub(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
 
 
 def _fold_mul(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
-    """Simplify a b: 1 x = x, 0 x = 0 of a finite x, -1 x = -x, (x + x) / 2 = x; None where nothing is simpler."""
+    """Return a simpler node for a b; None where nothing is simpler.
+
+    By 1 x = x, 0 x = 0 of a finite x, -1 x = -x, (x + x) / 2 = x and c (-x) = (-c) x of a constant c.
+    """
     if b.op == "constant":
         a, b = b, a
     if a.op != "constant":
@@ -261,7 +264,7 @@ def _fold_div(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
 
 
 def _fold_neg(graph: NodeMaker, type: Type, a: Node) -> Node | None:
-    """Simplify -(-x) to x."""
+    """Return the node of x for -a if a is -x; None where nothing is simpler."""
     return a.args[0] if a.op == "neg" else None
 
 
@@ -295,17 +298,17 @@ def _fold_xor(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
 
 
 def _fold_not(graph: NodeMaker, type: Type, a: Node) -> Node | None:
-    """Simplify not not x to x."""
+    """Return the node of x for `not a` if a is `not x`; None where nothing is simpler."""
     return a.args[0] if a.op == "not" else None
 
 
 def _fold_shift(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
-    """Simplify a shift by no bits."""
+    """Return a for a shift of a by b if b is the constant 0; None where nothing is simpler."""
     return a if _is_zero(b) else None
 
 
 def _fold_extremum(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
-    """Simplify max(x, x) and min(x, x) to x."""
+    """Return a for the larger or the smaller of a and b if these are the same node; None where nothing is simpler."""
     return a if a is b else None
 
 
@@ -330,7 +333,7 @@ def _fold_select(graph: NodeMaker, type: Type, condition: Node, a: Node, b: Node
 
 
 def _make_equality_rule(op: str) -> Callable[..., Node | None]:
-    """Return the rule that simplifies == or !=."""
+    """Return the rule that simplifies a comparison by == (op "eq") or != ("ne")."""
 
     def fold_flag_comparison(graph: NodeMaker, type: Type, a: Node, b: Node) -> Node | None:
         """Return a simpler node for a comparison by `op` ("eq" or "ne"), or None if there is none.

@@ -20,7 +20,7 @@ class Graph:
     """
 
     def __init__(self, max_nodes: int = 2 * LONGEST) -> None:
-        """Make a graph with one empty block, which is open; more than `max_nodes` nodes in all are refused."""
+        """Begin a program with one empty block, which is open; more than `max_nodes` nodes in all are refused."""
         self.max_nodes = max_nodes
         self.top = Block(None)  # the outermost block, around all loops
         self.current = self.top  # the open block
@@ -40,7 +40,7 @@ class Graph:
         return self._find_or_make(op, type, args, value)
 
     def constant(self, value: Number, type: Type) -> Node:
-        """Return the node of a constant; equal constants share one node.
+        """Return the node of a constant number; equal constants of a type share one node.
 
         A constant of type "f32" is rounded to single precision.
         """
@@ -84,7 +84,7 @@ class Graph:
         buffer.first[i] is the first entry of a row that equals entry i. It is empty if no entries are known to be
         equal.
         """
-        # Indices that are known become part of the offset; `varying` are the strides and indices of all others.
+        # Indices that are constants become part of the offset; `varying` are the strides and indices of all others.
         varying = [(s, i) for s, i in zip(strides, indices, strict=True) if i.op != "constant"]
         offset += sum(s * i.value for s, i in zip(strides, indices, strict=True) if i.op == "constant")
         if buffer.table is not None and not varying:
@@ -100,7 +100,10 @@ class Graph:
         return self._find_or_make("load", buffer.type, indices, value, buffer.block.depth)
 
     def store(self, buffer: Buffer, node: Node, offset: int, strides: Sequence[int], indices: Sequence[Node]) -> None:
-        """Add to the open block the statement buffer[offset + sum strides * indices] = node."""
+        """Add to the open block the statement buffer[offset + sum strides * indices] = node.
+
+        The indices are nodes, known when the program runs; with none of them the statement fills buffer[offset].
+        """
         statement = Store(self.current, buffer, node, offset, strides, indices)
         buffer.stores.append(statement)
         self.current.items.append(statement)

@@ -35,7 +35,10 @@ def make_jax_function(program: Program) -> Callable[..., PyTree]:
 
 
 class _JaxEvaluation:
-    """Values of nodes and numbers in memory while JAX traces the function."""
+    """Evaluation of a program's graph by JAX, operation by operation, while JAX traces the function.
+
+    A node is a scalar operation; a buffer is an array in memory that the program reads or fills.
+    """
 
     def __init__(self, program: Program):
         """Find the nodes that a program's results need (`needed`); raise Unsupported if a result is a random key.
@@ -80,7 +83,7 @@ class _JaxEvaluation:
         return self.memory[owner][offsets].reshape(value.shape)
 
     def value(self, node: Node) -> jax.Array:
-        """Return the value of a node."""
+        """Return the value of a node: a constant's number, or what was computed for it."""
         return jnp.asarray(node.value, DTYPES[node.type]) if node.op == "constant" else self.values[node]
 
     def evaluate_block(self, items: list[Any]) -> None:
@@ -122,12 +125,15 @@ class _JaxEvaluation:
         return computed
 
     def _locate_entry(self, buffer: Buffer, offset: int, strides: tuple[int, ...], indices: tuple[Node, ...]) -> Any:
-        """Return the index offset + sum strides * indices in the memory that a buffer uses."""
+        """Return the index of buffer[offset + sum strides * indices] in the outermost buffer that contains it.
+
+        The indices are nodes, so that the index is a number that JAX computes.
+        """
         pairs = zip(strides, indices, strict=True)
         return sum((s * self.value(i) for s, i in pairs), buffer.owner[1] + offset)
 
     def _find_filled(self, block: Block) -> list[Buffer]:
-        """Return the buffers that a block, or a block inside it, stores into."""
+        """Return the buffers that a block, or a block inside it, stores into, in the order of the stores."""
         stores = [x for x in self.needed if isinstance(x, Store) and block in x.block.list_enclosing_blocks()]
         return list(dict.fromkeys(x.buffer.owner[0] for x in sorted(stores, key=lambda x: x.node.serial)))
 

@@ -4,6 +4,7 @@ An array of the trace is a NumPy array of nodes (or of keys of random numbers), 
 references; or, if it is long, `StridedArray`. `RULES` has a rule for each operation of JAX, from the files of rules.
 """
 
+import math
 import os
 import sys
 import warnings
@@ -33,10 +34,10 @@ IN_MEMORY: dict[str, Rule] = {}  # the same of operations that take arrays in me
 
 
 class Lowering:
-    """Lowering of operations one after another into a graph."""
+    """Lowering of JAX's operations one after another: each is written as scalar operations (nodes) into a graph."""
 
     def __init__(self, most: int = 2 * LONGEST) -> None:
-        """Begin a program without operations; more than `most` nodes are refused."""
+        """Begin a program without operations; more than `most` nodes (scalar operations) are refused."""
         self.graph = Graph(most)
         # Programs of custom operations, traced for one run, by the operation and the shapes of its arguments.
         self.kernels: dict[Any, ClosedJaxpr] = {}
@@ -49,7 +50,10 @@ class Lowering:
         self.products: dict[Any, tuple[np.ndarray, np.ndarray]] = {}
 
     def inline_program(self, program: ClosedJaxpr | Jaxpr, inputs: Sequence[Value]) -> list[Value]:
-        """Return the results of a traced program for these arguments; only operations that they need are lowered."""
+        """Return the results of a traced program for these arguments: its operations are added to the graph.
+
+        Operations that no result needs are left out.
+        """
         jaxpr: Any = program
         consts: Sequence[Any] = ()
         if isinstance(program, ClosedJaxpr):
@@ -71,7 +75,7 @@ class Lowering:
         return [x if x.size else self._make_empty_view(a) for x, a in zip(values, avals, strict=True)]
 
     def _make_empty_view(self, aval: Any) -> StridedArray:
-        """Return an array without entries, in memory of its type and shape."""
+        """Return an array without entries, in memory of the type and shape that JAX says (`aval`)."""
         return StridedArray.of_whole_buffer(Buffer("scratch", type_of(aval), tuple(aval.shape), self.graph.top))
 
     def lower_equation(self, equation: JaxprEqn, inputs: list[Value]) -> Sequence[Value]:
@@ -106,11 +110,11 @@ class Lowering:
         return RULES[name](self, equation, [self.nodes(x) for x in inputs])
 
     def nodes(self, value: Value) -> np.ndarray:
-        """Return a value as a NumPy array of nodes."""
+        """Return a value as a NumPy array of nodes (scalar operations); an array in memory is loaded entry by entry."""
         return value.nodes(self.graph) if isinstance(value, StridedArray) else value
 
     def get_only_node(self, value: Value) -> Node:
-        """Return the only node of a condition; raise Unsupported if it has several entries."""
+        """Return the only entry of a condition, as a node; raise Unsupported if it has several."""
         nodes = self.nodes(value)
         if nodes.size != 1:
             raise Unsupported("a condition for each entry of an array")
@@ -138,8 +142,33 @@ class Lowering:
 
 
 def _convert_literal(number: Any, variable: Any) -> Any:
-    """Return a literal in the type that the trace has for it: of single precision it may be a number of Python."""
+    """Return a literal of JAX's program in the type that the program has for it.
+
+    In single precision a literal may be a number of Python, which would count as a double.
+    """
     return np.asarray(number, np.float32) if variable.aval.dtype == np.float32 else number
+
+
+def estimate_size(lowering: Lowering, jaxpr: Any) -> int:
+    """Return an estimate of how many numbers a traced program computes; `lowering.sizes` keeps the answers.
+
+    The body of a scan counts once for each iteration, and that of a while loop counts once.
+    """
+    if jaxpr in lowering.sizes:
+        return lowering.sizes[jaxpr]
+    total = 0
+    for equation in jaxpr.eqns:
+        inner = [estimate_size(lowering, getattr(p, "jaxpr", p)) for p in _list_inner_programs(equation.params)]
+        length = equation.params["length"] if equation.primitive.name == "scan" else 1
+        total += length * sum(inner) + sum(math.prod(v.aval.shape) for v in equation.outvars)
+    lowering.sizes[jaxpr] = total
+    return total
+
+
+def _list_inner_programs(params: dict[str, Any]) -> list[Any]:
+    """Return the traced programs among the parameters of an operation of JAX, such as a loop's body."""
+    values = [x for p in params.values() for x in (p if isinstance(p, tuple) else (p,))]
+    return [x for x in values if hasattr(x, "eqns") or hasattr(x, "jaxpr")]
 
 
 def make_refusal(operation: str, error: Exception, where: str) -> Unsupported:
@@ -166,12 +195,12 @@ def turn_failures_into_refusals(what: str) -> Iterator[None]:
 
 @cache
 def warn_once(text: str) -> None:
-    """Warn once in a process."""
+    """Give a warning with this text, once in a process."""
     warnings.warn(text, RuntimeWarning, stacklevel=2)
 
 
 def arrange_nodes(nodes: Iterable[Any], shape: tuple[int, ...]) -> np.ndarray:
-    """Return nodes, given in row-major order, as an array of objects of this shape."""
+    """Return nodes (or random keys), given in row-major order, as a NumPy array of objects of this shape."""
     flat = list(nodes)
     # NumPy must not look into the nodes, as np.array(flat) would.
     array = np.empty(len(flat), dtype=object)
@@ -180,7 +209,7 @@ def arrange_nodes(nodes: Iterable[Any], shape: tuple[int, ...]) -> np.ndarray:
 
 
 def make_keys(words: np.ndarray) -> np.ndarray:
-    """Return keys (...) from their words (..., 2)."""
+    """Return an array (...) of random keys from the nodes of their two words, an array (..., 2)."""
     flat = words.reshape(-1, 2)
     return arrange_nodes((RandomKey(*pair) for pair in flat), words.shape[:-1])
 
@@ -204,12 +233,12 @@ def type_of(value: Any) -> Type:
 
 
 def result_type(equation: JaxprEqn, index: int = 0) -> Type:
-    """Return the type of an operation's result."""
+    """Return the type of the numbers of an operation's result; one with several results has them at `index`."""
     return type_of(equation.outvars[index].aval)
 
 
 def result_shape(equation: JaxprEqn, index: int = 0) -> tuple[int, ...]:
-    """Return the shape of an operation's result."""
+    """Return the shape of an operation's result; one with several results has them at `index`."""
     aval: Any = equation.outvars[index].aval
     return tuple(aval.shape)
 
@@ -220,7 +249,7 @@ def make_placeholder(shape: Sequence[int], dtype: Any) -> Any:
 
 
 def known_integers(value: np.ndarray) -> np.ndarray | None:
-    """Return an array of nodes as integers, or None if one of the nodes is not a constant."""
+    """Return an array of nodes as integers, or None if one of the nodes is no constant, so that data decide it."""
     flat: list[Node] = value.ravel().tolist()
     if any(x.op != "constant" for x in flat):
         return None
@@ -241,7 +270,7 @@ def code_line(equation: JaxprEqn) -> str:
 
 
 class _NonArrayPart(NamedTuple):
-    """A part of a result that is no array, such as a function: it is put back as it is when the result is restored."""
+    """A part of a result that is no array, such as a function: kept as it is, where JAX would trace an array."""
 
     value: Any
 
@@ -254,7 +283,10 @@ HALVED = {np.dtype(x): np.dtype(y) for x, y in (("f8", "f4"), ("i8", "i4"), ("u8
 
 
 def _halve_precision(example: Any) -> Any:
-    """Return an example of the type that JAX has for it without enable_x64; a number of Python as it is."""
+    """Return an example of an argument as JAX takes it in single precision: with types of half as many bits.
+
+    A number of Python, whose type JAX chooses, stays as it is.
+    """
     kind = getattr(example, "dtype", None)
     return make_placeholder(example.shape, HALVED[kind]) if kind in HALVED else example
 
@@ -285,7 +317,7 @@ def trace_function(function: Callable[..., PyTree], *examples: PyTree, single: b
 
 
 def _list_used_equations(jaxpr: Jaxpr) -> list[JaxprEqn]:
-    """Return the operations that a program's results need, and those with effects, such as printing."""
+    """Return the operations of JAX's program that its results need, and those with effects, such as printing."""
     # Go backward, since all uses of an operation's results come after it.
     needed = {v for v in jaxpr.outvars if isinstance(v, Var)}
     used: list[JaxprEqn] = []

@@ -80,7 +80,7 @@ def choose_hasty_width(width: int) -> int:
 
 @cache
 def get_careful_thread() -> ThreadPoolExecutor:
-    """Return the one thread that generates optimised code, while calls execute the code that was quickly made.
+    """Return the executor with the one thread that generates optimised code, while calls execute the first code.
 
     All programs share it, so that optimised code is generated for one program after another.
     """
@@ -89,7 +89,7 @@ def get_careful_thread() -> ThreadPoolExecutor:
 
 @cache
 def _get_waiting_thread() -> ThreadPoolExecutor:
-    """Return the thread that generates code for which the main thread waits."""
+    """Return the executor with the one thread that generates code for which the main thread waits."""
     return ThreadPoolExecutor(1)
 
 
@@ -135,12 +135,13 @@ class TieredCode:
 
         `widths`: how many runs a vector has in quickly made code, and in optimised code.
         """
-        self._source, self._widths, self._executions, self._lock = source, widths, 0.0, Lock()
-        self._machine: MachineCode | None = None
-        self._optimised: Future[MachineCode] | None = None
+        self._source, self._widths = source, widths
+        self._executions, self._lock = 0.0, Lock()  # how often each operation was executed so far, on average
+        self._machine: MachineCode | None = None  # the code that calls execute at present
+        self._optimised: Future[MachineCode] | None = None  # the optimised code that a thread is making, or has made
 
     def generate_code(self, blocks: float) -> None:
-        """Generate code for a first execution for so many blocks, if there is none."""
+        """Generate machine code, if there is none yet, for a first call that computes so many blocks of runs."""
         with self._lock:
             self._make_first(self._executions + self._count_executions(blocks))
 

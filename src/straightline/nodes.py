@@ -104,7 +104,7 @@ class Block:
         self.items, self.seen, self.owner = [], {}, None
 
     def list_enclosing_blocks(self) -> Iterator["Block"]:
-        """Yield this block and the enclosing ones, outermost last."""
+        """Yield this block and the blocks around it, the outermost last."""
         block: Block | None = self
         while block is not None:
             yield block
@@ -115,7 +115,10 @@ class Block:
         return [b.owner for b in self.list_enclosing_blocks() if isinstance(b.owner, Loop)]
 
     def count_iterations(self) -> int:
-        """Return how many iterations these loops make together; of unknown length one."""
+        """Return how many times the block is executed: the product of the lengths of the loops around it.
+
+        A loop counts once if its length is not known when the program is compiled.
+        """
         lengths = [loop.length for loop in self.list_loops()]
         return math.prod(1 if length is None or length == ANY_LENGTH else length for length in lengths)
 
@@ -132,7 +135,7 @@ class Buffer:
     __slots__ = ("block", "first", "inside", "kind", "parts", "shape", "stores", "table", "type")
 
     def __init__(self, kind: str, type: Type, shape: tuple[int, ...], block: Block, table: np.ndarray | None = None):
-        """Describe an array in memory that no statement fills yet and no other buffer contains.
+        """Describe an array in memory that no statement of the program fills yet and no other buffer contains.
 
         Args:
             kind: what fills the array: "input", "scratch", "table" or "carried".
@@ -148,7 +151,7 @@ class Buffer:
         self.first: list[int] = []  # for each entry of a row the first entry with the same number; empty if all differ
 
     def place_buffer_inside(self, inner: "Buffer", start: int) -> None:
-        """Place another buffer inside this one, from an offset on."""
+        """Let another buffer be the part of this one from entry `start` on, so that filling it fills this one."""
         inner.inside = self, start
         self.parts.append(inner)
 
@@ -210,7 +213,7 @@ class Loop:
 
 
 class LoopExit:
-    """Exit of a loop, at this place of its body, unless some run's condition holds."""
+    """Exit of a loop that ends by a condition, at this place of its body: taken if the condition holds in no run."""
 
     __slots__ = ("loop",)
 
@@ -220,12 +223,15 @@ class LoopExit:
 
 
 class Guard:
-    """A body that is computed only if `condition` holds for some run; `results` are its `values`, else zeros."""
+    """A block that is computed only if `condition` holds for some run, like an "if" without an "else".
+
+    `values` are the block's numbers that are used outside, and `results` stand for them there: zeros if it is skipped.
+    """
 
     __slots__ = ("block", "body", "condition", "results", "values")
 
     def __init__(self, body: Block, condition: Node):
-        """Make the statement that computes the block `body` where `condition` holds in some run."""
+        """Make the statement that computes the block `body` if `condition`, a flag, holds in some run."""
         self.body, self.condition = body, condition
         self.block: Block = body.parent  # type: ignore[assignment]
         body.owner = self

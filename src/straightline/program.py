@@ -1,9 +1,4 @@
-"""Lowered programs: inputs, outputs, what these need, what differs between runs, fused products, and sums over runs.
-
-Run r of a sum over runs belongs to batch r mod BATCHES. A row of sums is W - 1 longer than the number of batches, W the
-most runs of a block, so that these never wrap around; what is beyond the end is added to the beginning
-(`fold_rows_into_batches`).
-"""
+"""Lowered programs: inputs, outputs, what these need, what differs between runs, fused products, and sums over runs."""
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -63,7 +58,7 @@ def lower_function(
     known: Known = MappingProxyType({}),
     single: bool = False,
 ) -> Program:
-    """Return a function of one run as a program of at most `most` scalar operations.
+    """Return a function of one run (one evaluation) as a program of at most `most` scalar operations.
 
     `examples` give the arguments' shapes and types. `known` maps the number of a leaf of the arguments to the entries
     that are the same in every call. `single`: whether numbers are float32.
@@ -78,29 +73,32 @@ def lower_traced(
     known: Known = MappingProxyType({}),
     single: bool = False,
 ) -> Program:
-    """Lower a program that JAX traced already; return its graph with a buffer for each argument.
+    """Lower a program that JAX traced: return it as a graph of scalar operations, with a buffer for each argument.
 
     Args:
         traced: the program, in single precision or in double.
         tree: the structure of its results.
-        most: operations above which it is refused.
+        most: number of operations above which it is refused; LONGEST is that of the longest program.
         known: by number of an argument, a mask of the entries that are the same in every call, and these numbers.
         single: whether numbers are float32.
     """
     lowering = Lowering(most)
-    shapes_and_types: list[Any] = [variable.aval for variable in traced.jaxpr.invars]
-    inputs, values = [], []  # of each argument its memory, and the array that the program computes with
-    for number, aval in enumerate(shapes_and_types):
+    # Of each argument its memory, and its value: a view of the memory, or an array of nodes (scalar operations).
+    inputs: list[Buffer] = []
+    values: list[Value] = []
+    for number, variable in enumerate(traced.jaxpr.invars):
+        aval: Any = variable.aval  # its shape and type
         is_key = jax.numpy.issubdtype(aval.dtype, jax.dtypes.prng_key)
         shape = (*aval.shape, 2) if is_key else aval.shape  # a random key is two numbers of 32 bits
         buffer = Buffer("input", "u32" if is_key else type_of(aval), shape, lowering.graph.top)
-        view = StridedArray.of_whole_buffer(buffer)
-        inputs.append(buffer)
+        value: Value = StridedArray.of_whole_buffer(buffer)
         if number in known:
             mask, numbers = known[number]
-            values.append(_insert_known_entries(lowering, view, mask, numbers))
-        else:
-            values.append(make_keys(view.nodes(lowering.graph)) if is_key else view)
+            value = _insert_known_entries(lowering, value, mask, numbers)
+        elif is_key:
+            value = make_keys(value.nodes(lowering.graph))
+        inputs.append(buffer)
+        values.append(value)
     with jax.enable_x64(not single):
         outputs = lowering.lower_whole_program(traced, values)
     return Program(graph=lowering.graph, inputs=inputs, outputs=outputs, tree=tree)
@@ -125,7 +123,7 @@ def _insert_known_entries(lowering: Lowering, view: StridedArray, mask: np.ndarr
 def list_needed_items(roots: Iterable[Node | Buffer]) -> dict[Any, None]:
     """Return the nodes, loops, guards, buffers and stores that `roots` need, as the keys of a dictionary.
 
-    A dictionary keeps their order. The order of a set, and with it the program's text, would change between processes.
+    A dictionary keeps their order; that of a set, and with it the program's text, would change between processes.
     """
     needed: dict[Any, None] = {}
     to_visit: list[Any] = list(roots)
@@ -146,7 +144,7 @@ def needs_arguments_alone(node: Any) -> bool:
 
 
 def _list_needs(node: Any) -> list[Any]:
-    """Return what a node or a statement needs: its arguments, memory, and the loop or guard around it.
+    """Return what an item of a program needs, directly: its arguments, memory, and the loop or guard around it.
 
     A buffer needs the statements that fill it, its parts, and the buffer that it lies in.
     """
@@ -200,9 +198,8 @@ def find_fused_product(node: Node, products: set[Node]) -> Node | None:
 def find_fusable_products(items: Iterable[Any]) -> set[Node]:
     """Return the products that are fused with the one sum or difference that uses them: a b + c, rounded once.
 
-    A product is fused if nothing else uses it and both are in one block. Of two products in a sum only the later one
-    is. Each fused product's attribute `value`, otherwise not used for products, is set to its sum: so the writer of
-    the sum finds it.
+    A product is fused if nothing else uses it and both are in one block; of two products in a sum only the later one
+    is. Its attribute `value`, otherwise not used for products, is set to its sum: so the writer of the sum finds it.
     """
     users: dict[Node, Any] = {}  # for each product the one item that uses it, or None if several do
     for item in items:
@@ -256,10 +253,9 @@ def sort_items_by_dependence(items: Iterable[Any]) -> list[Any]:
 
 
 def find_varying_items(items: Iterable[Any], inputs: Iterable[Buffer]) -> set[Any]:
-    """Return which nodes, buffers, loops and guards among `items` differ between runs if these input buffers do.
+    """Return which items (nodes, buffers, loops, guards) differ between runs if these input buffers do, with these.
 
-    A program is evaluated for many runs side by side; what is equal in all of them is computed once. A node is a number
-    that is computed, a buffer is memory, a guard is a conditional block. The input buffers are in the result.
+    A node is a number that is computed, a buffer is memory, a guard a conditional block; a run is one evaluation.
     """
 
     @cache
@@ -325,8 +321,8 @@ def _find_memory_read_in_parts(items: Iterable[Any]) -> set[Buffer]:
 def find_crossing_items(items: Iterable[Any], differing: set[Any]) -> set[Any]:
     """Return the items of the code that computes what differs between runs, for a block of runs at once.
 
-    They are the items that differ (`differing`), the stores into memory that differs, and the loops and guards in which
-    these stand: a loop is also executed there if only a part of its body differs.
+    They are the items that differ (`differing`), the stores into memory that differs, and the loops and guards around
+    them: a loop is also executed there if only a part of its body differs.
     """
     found = {x for x in items if x in differing or (isinstance(x, Store) and x.buffer.owner[0] in differing)}
     to_visit = list(found)
@@ -345,8 +341,8 @@ def find_crossing_items(items: Iterable[Any], differing: set[Any]) -> set[Any]:
 def _list_sources(item: Any, list_owners: Callable[[Block], list[Any]]) -> list[Any]:
     """Return the items on which a node, buffer or statement depends: it differs between runs if one of them does.
 
-    Stores, guards (conditional blocks) and loops are statements. `list_owners` returns the loops and guards around a
-    block on whose conditions its contents depend.
+    Statements are stores, guards (conditional blocks) and loops. `list_owners` returns those around a block on whose
+    conditions its contents depend.
     """
     # Memory inside other memory differs with it.
     if isinstance(item, Buffer):
@@ -384,7 +380,11 @@ class SummedOutputs(NamedTuple):
 
 
 def row_length_of_sums(width: int, batches: int) -> int:
-    """Return the length of a row of sums."""
+    """Return how many partial sums an output that is summed over runs has in memory.
+
+    Run r belongs to batch r mod `batches`. A block of `width` runs adds to as many neighbouring sums, from the batch
+    of its first run on: up to width - 1 of them lie beyond the last batch, so that the row does not wrap around.
+    """
     return batches + width - 1
 
 

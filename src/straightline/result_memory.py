@@ -31,6 +31,7 @@ class _LoanedBytes:
         self.__array_interface__ = memory.__array_interface__
 
     def __del__(self, ends: Callable[[], bool] = sys.is_finalizing) -> None:
+        """Keep the memory for later results, unless the process ends."""
         if not ends():  # at the end of the process the names of this module are gone
             _keep_memory(self._memory)
 
@@ -48,7 +49,7 @@ def make_aligned_array(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
 
 
 def align_to_cache_line(memory: np.ndarray) -> np.ndarray:
-    """Return all but a line of some bytes, from the first one on that begins a line."""
+    """Return the part of an array of bytes that begins at a multiple of a cache line, LINE bytes shorter than it."""
     start = -memory.ctypes.data % LINE
     return memory[start : start + len(memory) - LINE]
 

@@ -106,7 +106,7 @@ def _find_recurring(loop: Loop, needed: Collection[Any]) -> RecurringNodes | Non
 
 
 def _list_nodes_of_body(nodes: Sequence[Node], body: Block) -> list[Node]:
-    """Return those of the numbers that are computed in a loop's body: all others are there before it."""
+    """Return those of the nodes (numbers) that a loop's body computes; all others are known before the loop."""
     return [n for n in nodes if n.block is body]
 
 
@@ -184,7 +184,10 @@ class RingBuffer:
         self._columns = [(buffers[type], types[:k].count(type)) for k, type in enumerate(types)]
 
     def store(self, nodes: Iterable[Node], row: Node) -> None:
-        """Store these numbers, in the order of the types, as a row of the ring."""
+        """Add to the open block of the program the stores of these numbers as a row of the ring.
+
+        There is one number of each of the ring's types, in their order; `row` is the node of the row's number.
+        """
         for n, (buffer, column) in zip(nodes, self._columns, strict=True):
             self._graph.store(buffer, n, column, buffer.shape[1:], (row,))
 
@@ -361,12 +364,12 @@ def _carry_integer(graph: Graph, loop: Loop, start: int) -> Node:
 
 
 def _read_bits(graph: Graph, node: Node) -> Node:
-    """Return the bits of a number, a real one as an integer."""
+    """Return the node of a number whose bits can be compared: a real one is read as an integer of as many bits."""
     return graph.node("bitcast", INTEGERS[node.type], node) if node.type in REAL else node
 
 
 def _replace_uses(x: Any, replaced: Mapping[Node, Node]) -> None:
-    """Let a node or a statement use the values of `replaced` in the place of its keys."""
+    """Change a node or a statement, in place, so that it uses the nodes replaced[n] in the place of the nodes n."""
 
     def replace_all(nodes: Sequence[Node]) -> list[Node]:
         """Return the nodes with those replaced that have a replacement."""

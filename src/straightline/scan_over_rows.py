@@ -26,7 +26,10 @@ class CompiledScan:
     """
 
     def __init__(self, program: Program):
-        """Write the code as text of LLVM, which the first call compiles; arrays of rows have ANY_LENGTH in it."""
+        """Write the code as text of LLVM, which the first call compiles.
+
+        In the program's shapes ANY_LENGTH stands for the number of rows, which the code reads when it is called.
+        """
         self._shapes, self._types = [b.shape for b in program.inputs], [DTYPES[b.type] for b in program.inputs]
         self._tree, (*_, fuses) = program.tree, find_processor_features()
         self._code = write_module(program, [False] * len(self._shapes), width=None, fuse=fuses, alone=True)
@@ -67,7 +70,10 @@ class CompiledScan:
         return jax.tree.unflatten(self._tree, outputs)
 
     def _count_rows(self, arrays: Sequence[np.ndarray]) -> int:
-        """Return the number of rows of a call; raise ValueError unless all arrays have the shapes of the example."""
+        """Return the number of rows of a call; raise ValueError unless all arrays have the shapes of the example.
+
+        In the example's shapes, ANY_LENGTH as the first length stands for the number of rows.
+        """
         count = next(
             (len(x) for x, s in zip(arrays, self._shapes, strict=True) if s[:1] == (ANY_LENGTH,) and x.ndim), 0
         )
@@ -122,7 +128,7 @@ def compile_scan(
 
 
 def _find_dtype(x: Any) -> Any:
-    """Return the type of a number or of an array's numbers, in double precision."""
+    """Return the NumPy type of an array's numbers, or of a number of Python, such as float64 of 0.5."""
     return x.dtype if hasattr(x, "dtype") else np.asarray(x).dtype
 
 

@@ -12,7 +12,11 @@ from straightline.size_limits import LOADED
 
 
 class StridedArray:
-    """Array with entry (i, j, ...) at offset + sum strides * (i, j, ...) + sum of moves, pairs (stride, node)."""
+    """Array with entry (i, j, ...) at offset + sum strides * (i, j, ...) + sum of moves, pairs (stride, node).
+
+    It lies in a buffer, an array in memory of the program that is being written. A node is a number that the program
+    computes, and so is known only when it runs.
+    """
 
     __slots__ = ("buffer", "loaded", "moves", "offset", "shape", "strides")
 
@@ -55,7 +59,7 @@ class StridedArray:
     def view(
         self, shape: Sequence[int], strides: Sequence[int], offset: int = 0, *moves: tuple[int, Node]
     ) -> "StridedArray":
-        """Return another view of the same memory; `offset` and `moves` (stride, node) are added to this view's."""
+        """Return another view of the same memory; `offset` and `moves`, pairs (stride, node), add to this view's."""
         return StridedArray(self.buffer, tuple(shape), tuple(strides), self.offset + offset, (*self.moves, *moves))
 
     def row(self, index: Node | int) -> "StridedArray":
@@ -90,7 +94,7 @@ class StridedArray:
         return self.loaded[1]
 
     def _load_entries(self, graph: Graph) -> np.ndarray:
-        """Return an array of nodes, each of which loads its entry from memory."""
+        """Return a NumPy array of nodes (operations of the program), each of which loads its entry from memory."""
         strides, indices = [s for s, _ in self.moves], [i for _, i in self.moves]
         nodes = np.empty(self.shape, dtype=object)
         for index in product(*map(range, self.shape)):
@@ -113,31 +117,34 @@ def _merge_axes(axes: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
 
     Two neighbouring axes (n_a, s_a) and (n_b, s_b) with s_a = n_b s_b are the same as one axis (n_a n_b, s_b).
     """
-    merged: list[tuple[int, int]] = []
+    merged: list[tuple[int, int]] = []  # the last axis first
     for length, stride in reversed(axes):
-        if merged and stride == merged[-1][0] * merged[-1][1]:
-            merged[-1] = length * merged[-1][0], merged[-1][1]
-        else:
-            merged.append((length, stride))
+        if merged:
+            next_length, next_stride = merged[-1]
+            if stride == next_length * next_stride:
+                merged[-1] = length * next_length, next_stride
+                continue
+        merged.append((length, stride))
     return merged[::-1]
 
 
 def _split_axes(axes: Sequence[tuple[int, int]], shape: Sequence[int]) -> list[int] | None:
     """Return the strides of an array of this shape whose axes are parts of these ones, in order; None if none are.
 
-    axes: pairs of length and stride, merged, with as many entries as the shape. From the last axis on, each new axis
-    is split off what is left of an old one.
+    An old axis (6, 1), a pair of length and stride, becomes for the shape (2, 3) the axes (2, 3), (3, 1), whose strides
+    are [3, 1]. The new axes are split off the old ones from the last one on. The old ones have as many entries together
+    as the shape, and no two of them are contiguous in memory (`_merge_axes`).
     """
     remaining_axes = list(axes)
     left, stride = 1, 0  # entries of the present old axis that are not split off yet, and the stride between them
-    strides: list[int] = []
+    strides: list[int] = []  # of the new axes, the last one first
     for length in reversed(shape):
-        if length == 1:
+        if length == 1:  # there is no step along it, whatever its stride
             strides.append(0)
             continue
-        if left == 1:
+        if left == 1:  # the present old axis is used up: take the one before it, which exists since the sizes agree
             left, stride = remaining_axes.pop()
-        if left % length:
+        if left % length:  # the new axis would reach across two old ones
             return None
         strides.append(stride)
         left, stride = left // length, stride * length

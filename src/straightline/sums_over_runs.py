@@ -23,7 +23,8 @@ PARTS = 64  # sums of their own, which computers of any number of cores share ou
 class SummingProgram:
     """Compiled program of a run's number and of arguments that all runs share: some results are summed over runs.
 
-    `common` says of each result, leaf by leaf, whether all runs share it, and `summed` whether it is summed.
+    A run is one evaluation of the program, such as one path of a Monte Carlo simulation. `common` says of each result,
+    leaf by leaf, whether all runs share it, and `summed` whether it is summed.
     """
 
     def __init__(self, program: Program, summed: SummedOutputs):
@@ -31,7 +32,7 @@ class SummingProgram:
 
         `summed` says which results are summed, and which argument (`number`) is the number of the run. Only that
         argument differs between runs. `self.once` is the code that computes what all runs share, None if there is
-        nothing. `self.blocks` is the code of everything else, for blocks of runs.
+        nothing. `self.blocks` is the code of everything else, for blocks of runs: as many as a vector has lanes.
         """
         differs = [n == summed.number for n in range(len(program.inputs))]
         self.summed, self.tree = summed, program.tree
@@ -47,10 +48,13 @@ class SummingProgram:
     def measure_memory(self, runs: int, lanes: int, in_flight: int) -> tuple[float, float, float]:
         """Return three sizes in bytes: of results collected run by run, of sums, and of a computation's variables.
 
-        `lanes` sums are kept apart, each with a number for each lane and batch. All runs share some of the variables.
-        Each of the `in_flight` blocks that are computed at once has variables of its own.
+        Args:
+            runs: how many runs are collected.
+            lanes: how many sums are kept apart, each with a row of numbers for each entry of a summed result.
+            in_flight: how many blocks of runs are computed at once, each with variables of its own. Other variables
+                exist once, since all runs share them.
         """
-        length = row_length_of_sums(self.width, self.summed.batches)
+        length = row_length_of_sums(self.width, self.summed.batches)  # numbers in the row of one summed result
         bytes_of_run = bytes_of_sums = 0.0
         for buffer, is_summed, is_common in zip(self.code.outputs, self.summed.outputs, self.common, strict=True):
             if is_common:
@@ -99,14 +103,24 @@ class SummingProgram:
     ) -> list[Any]:
         """Return each result, leaf by leaf, from the sums of parts of the runs and from what each part collected.
 
-        A summed result is the sum over all parts of the runs. A collected result has the parts one behind another. A
-        result that all runs share is repeated for each run, or if it is summed, multiplied by the runs of each batch.
+        A summed result, (..., batch), is the sum over all parts, for each batch of runs. A collected result, (run,
+        ...), has the parts one behind another. A result that all runs share was computed once: it is repeated for each
+        run, or if it is summed, multiplied by the number of runs of each batch.
+
+        Args:
+            bound: the program with its arguments.
+            sums: of each part its arrays of sums, one for each summed result that runs do not share.
+            collected: of each part an array for each result, None where it is summed or shared.
+            first: number of the first run.
+            runs: number of all runs.
         """
         totals = iter(bound.add_partial_sums(sums))
         runs_by_batch = _count_runs_by_batch(first, runs, self.summed.batches)
         leaves: list[Any] = []
+        # `bound.shared` has the numbers of a result that all runs share, None for a result that differs between runs.
         for shared, is_summed, *parts in zip(bound.shared, self.summed.outputs, *collected, strict=True):
-            if shared is None:
+            differs_between_runs = shared is None
+            if differs_between_runs:
                 leaves.append(next(totals) if is_summed else np.concatenate(parts))
             elif is_summed:
                 leaves.append(shared[..., None] * runs_by_batch)
@@ -119,29 +133,43 @@ class SummingProgramWithArguments:
     """A summing program whose shared arguments are given; `shared`: results that all runs share, None for others."""
 
     def __init__(self, program: SummingProgram, arguments: Sequence[Any], runs: int):
-        """Convert the arguments, compute what all runs share, and choose machine code for blocks of runs.
+        """Convert the arguments, compute once what all runs share, and choose the machine code for the runs to follow.
 
-        `arguments` are all but the run's number. `runs` is about how many runs will follow: for many, the code is
-        optimised.
+        Args:
+            program: the compiled program.
+            arguments: all its arguments but the number of the run, as leaves.
+            runs: about how many runs will follow; for many of them optimised code is chosen.
         """
         self.program, self.summed = program, program.summed.outputs
         self.arguments = [convert_to_memory(x, t) for x, t in zip(arguments, program.types, strict=True)]
+        # Bytes of the numbers that all runs share, and the results among them.
         self.memory = allocate_aligned(program.code.shared)
-        self.shared: list[np.ndarray | None] = [None] * len(program.common)
         if program.once is not None:
-            # This code fills `self.memory`. It reads no number of a run and writes no result of one: both are dummies.
-            number, results = np.zeros(1, np.uint32), [np.empty(0)] * len(program.common)
-            pointers = self._list_pointers(number, results)
-            machine = program.once.choose_machine(1)
-            machine.run(pointers.ctypes.data, 0, 0, 1, 1)
-        # The results that all runs share (`common`), from their bytes in `self.memory`.
-        for n, (buffer, offset) in enumerate(zip(program.code.outputs, program.code.offsets, strict=True)):
-            if program.common[n]:
-                kind = np.dtype(DTYPES[buffer.type])
-                computed = self.memory[offset : offset + buffer.size * kind.itemsize]
-                self.shared[n] = computed.view(kind).reshape(buffer.shape).copy()
+            self._fill_shared_memory(program.once)
+        self.shared = self._read_shared_results()
         blocks = divide_rounded_up(runs, program.width)  # a block is as many runs as a vector has
+        # Code for the runs; none is needed if they share all results.
         self._machine = None if all(program.common) else program.blocks.choose_machine(blocks)
+
+    def _fill_shared_memory(self, once: TieredCode) -> None:
+        """Compute what all runs share into `self.memory`, by the code `once` that was made for it."""
+        # The code reads no run's number and writes no run's results: arrays without a meaning stand for both.
+        number, results = np.zeros(1, np.uint32), [np.empty(0)] * len(self.program.common)
+        pointers = self._list_pointers(number, results)
+        # The arguments: addresses of the arrays and of scratch memory (none); blocks 0 to 1, and 1 run.
+        once.choose_machine(1).run(pointers.ctypes.data, 0, 0, 1, 1)
+
+    def _read_shared_results(self) -> list[np.ndarray | None]:
+        """Return copies of the results that all runs share, from their bytes in `self.memory`; None for all others."""
+        code, shared = self.program.code, list[np.ndarray | None]()
+        for output, offset, is_common in zip(code.outputs, code.offsets, self.program.common, strict=True):
+            if is_common:
+                number_type = np.dtype(DTYPES[output.type])
+                computed = self.memory[offset : offset + output.size * number_type.itemsize]
+                shared.append(computed.view(number_type).reshape(output.shape).copy())
+            else:
+                shared.append(None)
+        return shared
 
     def make_zero_sums(self, memory: list[list[np.ndarray]] | None = None) -> list[np.ndarray]:
         """Return zeros for the sums of each summed result that runs do not share.
@@ -173,6 +201,7 @@ class SummingProgramWithArguments:
             scratch = allocate_aligned(self.program.code.scratch)
             pointers = self._list_pointers(numbers, outputs)
             blocks = divide_rounded_up(len(numbers), self._machine.width)  # a block: the runs of one vector
+            # The arguments: addresses of the arrays and of scratch memory; blocks 0 to `blocks`, and the count of runs.
             self._machine.run(pointers.ctypes.data, scratch.ctypes.data, 0, blocks, len(numbers))
         return collected
 
@@ -235,7 +264,8 @@ def accumulate(
     """Compile a JAX function of a run's number; return a program that sums its results over runs, or collects them.
 
     A Monte Carlo simulation is such a function: the run's number makes its random key. Sums take no more memory for
-    more runs. The program is called with the arguments and with `runs`; `begin` and `add` compute runs a few at a time.
+    more runs. The program is called with the arguments and with `runs`; what its method `bind_arguments` returns
+    computes runs a few at a time, by `add_runs`.
 
     Args:
         function: of the arguments, which all runs share, and of the number of the run (uint32); it returns a pair, what

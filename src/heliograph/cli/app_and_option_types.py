@@ -21,12 +21,12 @@ app = App(
 
 
 def integer_option(text: str) -> Parameter:
-    """Declare an option that is an integer."""
+    """Return the declaration of an option that is an integer, with the text of its help."""
     return Parameter(help=text, converter=_convert_to_int)
 
 
 def path_option(text: str = "") -> Parameter:
-    """Declare an option that is a file or folder."""
+    """Return the declaration of an option that is the path of a file or folder, with the text of its help."""
     return Parameter(help=text, converter=_convert_to_path)
 
 
@@ -37,12 +37,12 @@ MEASURED = (
 
 
 def measured_option(text: str = MEASURED) -> Parameter:
-    """Declare an option that is measured data: a file, or the URL of a store."""
+    """Return the declaration of an option that is measured data, a file or the URL of a store, with its help."""
     return Parameter(help=text, converter=_convert_to_path_or_store, accepts_keys=False, n_tokens=1)
 
 
 def estimates_option() -> Parameter:
-    """Declare an option that is where estimates go: a file, or the URL of a store."""
+    """Return the declaration of an option that is where estimates go: a file, or the URL of a store."""
     return Parameter(
         help="CSV, Parquet or MCAP to write, or influx:// or postgresql://...?table=: estimates with their claims.",
         converter=_convert_to_path_or_store,

@@ -50,8 +50,10 @@ def design(
 
 
 def count_stages(file: "DesignFile") -> int:
-    """Return the approximate number of steps for the progress bar."""
-    # They are the design, the rows of the map, the budgets of the front, and about three changes for each node.
+    """Return the approximate number of steps of `compute_design`, for its progress bar.
+
+    They are the design, the rows of the map, the budgets of the front, and about three changes for each node.
+    """
     from heliograph.planning.design_comparisons import POINTS
 
     rows = 0 if file.map is None else len(file.map.y)
@@ -59,7 +61,11 @@ def count_stages(file: "DesignFile") -> int:
 
 
 def compute_design(file: "DesignFile", advance: "Advance") -> "DesignResults":
-    """Compute the design, the least error over total powers around its own, what changes are worth, and the map."""
+    """Return what a task of a design asks for, computed: the designed powers, and what surrounds them.
+
+    That is the powers before, the least error over total powers around the design's own, what changes of the network
+    are worth, and a map of the error over sites of a node if the task has one. `advance` is called with the progress.
+    """
     import heliograph as hg
     from heliograph.files.design_file import make_designed_source
     from heliograph.planning.design_comparisons import list_totals_about

@@ -124,7 +124,12 @@ def filter_rows(
 ) -> tuple["Record", list[str]]:
     """Return the record of the filtered rows, and the warnings that were given meanwhile as lines.
 
-    `after` is the record of the earlier rows, None if there are none.
+    Args:
+        network: the network, whose filters are run.
+        recording: the rows.
+        smooth: how to smooth the estimates; None for not.
+        after: the record of the earlier rows of the same recording, from whose end the filters go on; None if the rows
+            are the first.
     """
     with warnings.catch_warnings(record=True) as doubts:
         warnings.simplefilter("always", UserWarning)
@@ -185,14 +190,17 @@ def _select_rows_of_record(record: "Record", rows: "np.ndarray | None") -> "Reco
 
 
 def _make_forecasts(record: "Record", ahead: "Horizons") -> "ByFilter":
-    """Return forecasts from the last row by node and filter; inputs are held as they are there."""
+    """Return forecasts from a record's last row by node and filter; inputs stay what they are in that row.
+
+    `ahead` says how far: a number of rows, or a list of spans of time, dates and numbers.
+    """
     forecasts = heliograph.forecast(record, ahead, inputs="held")
     assert isinstance(forecasts, dict)  # the record is of a network
     return forecasts
 
 
 def _describe_forecasts(forecasts: "ByFilter") -> str:
-    """Return a line on how far forecasts go, and with which inputs."""
+    """Return a line for the user on how far forecasts go, and with which inputs."""
     from heliograph.numerics.times.dates import format_times
 
     any_forecast = next(forecast for filters in forecasts.values() for forecast in filters.values())
@@ -202,7 +210,7 @@ def _describe_forecasts(forecasts: "ByFilter") -> str:
 
 
 def _select_times_of_predictions(predicted: "ByFilter", rows: "np.ndarray | None") -> "ByFilter":
-    """Return the predictions of some rows; `rows` is a mask, None for all."""
+    """Return the predictions, by node and filter, of the rows in the mask `rows` (rows,); None takes all rows."""
     if rows is None or rows.all():
         return predicted
     selected = {}
@@ -219,7 +227,16 @@ def _write_estimates(
     target: Path | StoreAddress,
     data: "MeasuredPlant",
 ) -> None:
-    """Write estimates, with rows of forecasts below them and columns of what was predicted where there are any."""
+    """Write a plant's estimates, with its forecasts as rows below them and its predictions as columns beside them.
+
+    Args:
+        write: writes estimates alone, to any target.
+        record: the estimates.
+        forecasts: forecasts after the last row, by node and filter; {} for none.
+        predicted: what was predicted of each row, by node and filter; {} for none.
+        target: the file or the table of a store.
+        data: the plant's data, which have its name and the date of time 0.
+    """
     if not forecasts and not predicted:
         write(record, target)
         return
@@ -267,7 +284,10 @@ def _write_lagged_estimates(
 
 
 def _make_estimates_writer(data: "MeasuredPlant", module: "Mapping[str, object]") -> "Write":
-    """Return a function that writes estimates to a store, a table, or MCAP with the pose that `module` names."""
+    """Return the function that writes a plant's estimates to a store, a table, or a bag (MCAP).
+
+    `module` holds the names in the network's file; its `pose` says which states are the pose in a bag.
+    """
     from heliograph.files.bags.estimates_writer import write_bag
     from heliograph.files.estimates.estimates_table import estimate_columns, write_estimates
     from heliograph.files.stores.store_tables import write_columns_to_store
@@ -291,6 +311,6 @@ def _make_estimates_writer(data: "MeasuredPlant", module: "Mapping[str, object]"
 
 
 def _find_date_of_time_zero(data: "MeasuredPlant") -> "np.datetime64 | None":
-    """Return the date of time 0, of messages whose times are dates."""
+    """Return the date that the times of a plant's messages count from; None of rows, steps, and times without dates."""
     messages = data.events
     return None if messages is None or messages.steps or messages.numbers else messages.date

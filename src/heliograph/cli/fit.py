@@ -194,7 +194,19 @@ def _read_rows_to_fit(
     truth: bool,
     reading: ReadingOptions,
 ) -> MeasuredPlant:
-    """Read rows of a table, or messages, which are rows in the order of measuring; say what was left out."""
+    """Return the measured rows of the only plant, and print what was used, left out, or could not be read.
+
+    Args:
+        measurements: a table of rows, messages (put in rows by the time of measuring), or a store.
+        reference: the network as the user named it, FILE or FILE:NAME.
+        network: the network.
+        advance: called with the progress.
+        truth: whether the rows must have the true states.
+        reading: how the data are read.
+
+    Raises:
+        ValueError: data of several plants, or no true states where they are needed.
+    """
     from heliograph.disk.quoted_text import visible
     from heliograph.files.network_file import load_module
     from heliograph.numerics.check import fail
@@ -263,7 +275,10 @@ def _fit_with_progress(
 
 
 def collect_results_files(learned: "FitResults", out: Path, network: str) -> "ResultsContent":
-    """Return what goes into the results folder of a fit: figures, page, summary, network with the fitted numbers."""
+    """Return what goes into the results folder `out` of a fit: figures, page, summary, network with the fitted numbers.
+
+    `network` is the network as the user named it, FILE or FILE:NAME.
+    """
     from heliograph.files.fitted import as_json, write_fitted
     from heliograph.report.pages.fit import draw_fit_figures, make_page_of_drawings
     from heliograph.report.results_folder import ResultsContent

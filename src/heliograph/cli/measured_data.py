@@ -151,11 +151,24 @@ def read_events(
     options: ReadingOptions,
     advance: "Advance",
 ) -> "EventTable | None":
-    """Read the messages of a bag, a file or a store; None for rows of time.
+    """Return the messages of a bag, a file or a store as events, values of outputs with their times.
 
-    Measured data are a table with a row for each time, or messages that come whenever they come; the latter need
-    `sources` in the network's file, which say which topic and field is which output. `reference`: the network as the
-    user named it, for errors. `module`: the names that the network's file defines. `advance`: called with the progress.
+    Measured data are a table with a row for each time, or messages that come whenever they come, each of some outputs.
+    The latter need `sources` in the network's file, which say which topic and field is which output.
+
+    Args:
+        path: the file or folder, or the table of a store.
+        reference: the network as the user named it, FILE or FILE:NAME, for errors.
+        network: the network.
+        module: names and values that the network's file defines; "sources" may be one.
+        options: how the data are read.
+        advance: called with the progress.
+
+    Returns:
+        The events; None if the data are a table of rows of time, which `read_rows` reads.
+
+    Raises:
+        ValueError: messages without sources, or what cannot be read.
     """
     from heliograph.files.bags.ros_bag import is_bag
     from heliograph.files.logs.vehicle_log import is_log
@@ -174,6 +187,7 @@ def read_events(
         raise fail(f"network {reference}", f"sources, for the topics of {path} ({hint})", "none")
 
     def progress(done: int, total: int) -> None:
+        """Show how much of the data is read."""
         advance(f"reading {path}", done, total)
 
     return read_mapped(path, network, sources, progress, options.strict, options.ignore_unknown)
@@ -194,7 +208,11 @@ def read_rows(path: "Path | StoreTable", network: "Network", options: ReadingOpt
 
 
 def _make_rows_of_events(events: "EventTable", plant: str, options: ReadingOptions) -> MeasuredPlant:
-    """Return the rows of a plant from its events, with a line by node on how many events were used, late or lost."""
+    """Return the data of one plant as rows of time, made from its events, the messages with measured values.
+
+    The options say how late an event may come to be used. The result has a line for each node on how many events were
+    used, came too late, and so on, and on how many were lost by the numbers of their sequence.
+    """
     import numpy as np
 
     window, ahead = options.limits
@@ -214,13 +232,18 @@ def _make_rows_of_events(events: "EventTable", plant: str, options: ReadingOptio
 
 
 def describe_unreadable_messages(path: object, events: "EventTable") -> list[str]:
-    """Return lines on where reading ended early, and on how many messages could not be read, with the first reasons."""
+    """Return lines on messages that were not used: where reading ended early, and how many could not be read.
+
+    `events.refused` is the count of all messages that could not be read, `events.refusals` the counts of each reason by
+    node, of those messages whose node is known, and `events.reasons` the first errors in words.
+    """
     from heliograph.model.checks.refusal_reasons import describe_counts
 
-    lines = [events.broken] if events.broken else []
+    lines = [events.broken] if events.broken else []  # why reading ended early
     if events.refused:
-        by_node = [f"{node}: {describe_counts(counts)}" for node, counts in events.refusals.items()]
-        lines.append(describe_refusals(path, "messages", events.refused, events.reasons, "; ".join(by_node)))
+        counts_by_node = [f"{node}: {describe_counts(counts)}" for node, counts in events.refusals.items()]
+        known_reasons = "; ".join(counts_by_node)
+        lines.append(describe_refusals(path, "messages", events.refused, events.reasons, known_reasons))
     return lines
 
 

@@ -123,7 +123,10 @@ def _yield_events_of_plants(
 
 
 def _describe_too_fine_dates(path: "Path | StoreTable", time: "np.ndarray") -> list[str]:
-    """Return a line on how many dates are finer than a microsecond, to which messages round them; [] if none is."""
+    """Return a line on how many dates have digits below a microsecond, which messages lose; [] if none has.
+
+    `path` is what was read, for the line; `time` are its times, which may be numbers rather than dates.
+    """
     if time.dtype.kind != "M":
         return []
     finer = int((time != time.astype("datetime64[us]")).sum())

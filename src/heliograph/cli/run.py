@@ -181,7 +181,7 @@ def _check_options(
 
 
 def _describe_results(record: "Record", out: Path | StoreAddress | None, report: Path | None) -> list[str]:
-    """Return a line on what was written where, and one on the errors of each filter."""
+    """Return a line on what was written to `out` and `report`, and a line on the errors of each filter, if known."""
     written = WrittenRowCounts()
     written.add(record)
     targets = [path for path in (out, report and report / "report.html") if path is not None]
@@ -189,7 +189,11 @@ def _describe_results(record: "Record", out: Path | StoreAddress | None, report:
 
 
 def _describe_estimation_errors(record: "Record") -> list[str]:
-    """Return a line on the errors of each filter, if the truth is known: RMSE by state, and NEES (1: claim holds)."""
+    """Return a line on the errors of each filter, if the true states are known; else no line.
+
+    It has the root mean square error of each state, and the normalised error squared (NEES) per state, which is 1 if
+    the covariance that the filter claims is that of its errors.
+    """
     from heliograph.report.diagnosis.sensor_output_health import compute_filter_errors, round_to
 
     lines = []
@@ -258,7 +262,10 @@ def _refuse_losing_files(
 def _refuse_replacing_inputs(
     measurements: Path | StoreAddress, out: Path | StoreAddress | None, network: "Network", sources: object
 ) -> None:
-    """Raise ValueError if estimates would replace one of the files that are read from a folder of measurements."""
+    """Raise ValueError if estimates would replace one of the files that are read from a folder of measurements.
+
+    `sources`, of the network's file, say which files of the folder are read; None if it has none.
+    """
     from heliograph.files.messages.folder_of_message_files import is_message_folder, list_used_files
     from heliograph.files.sources.topic_reader import TopicReader
     from heliograph.numerics.check import fail
@@ -286,9 +293,9 @@ def _write_report(name: str, network: "Network", plants: "Sequence[FilteredPlant
     from heliograph.report.results_folder import ResultsContent, write_results
 
     def examine_plant(plant: "FilteredPlant", advance: "Advance") -> Health:
-        """Return the diagnosis of a plant with its forecasts, predictions, residuals, and refusals by node.
+        """Return the diagnosis of a plant's record, completed by its forecasts, predictions and refused messages.
 
-        Residuals are what was not predicted. There are some only if predictions were asked for.
+        Residuals, what was measured less what was predicted, are part of it if predictions were asked for.
         """
         record, inputs = plant.record, plant.data.recording.inputs
         residuals = heliograph.forecasting.record_residuals(record, inputs) if plant.predicted else {}

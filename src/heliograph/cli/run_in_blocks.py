@@ -149,6 +149,7 @@ def filter_in_blocks(
     from heliograph.numerics.check import InputError
 
     def progress(done: int, total: int) -> None:
+        """Show how much of the table is read and filtered."""
         advance(f"filtering {path}", done, total)
 
     blocks = RecordingBlocks(path, network, options.strict, options.ignore_unknown, block, progress)

@@ -40,7 +40,7 @@ class WorthOptions:
 
     @property
     def is_asked(self) -> bool:
-        """Return whether anything is asked."""
+        """Return whether a case is asked for: a node to leave out, an outage, or a node to try."""
         return bool(self.without or self.outage or self.added)
 
 
@@ -85,7 +85,10 @@ def compute_worth(network: "Network", module: Mapping[str, object], options: Wor
 
 
 def _check_figure_writable(figure: Path) -> None:
-    """Raise the error of writing the figure before the work: no matplotlib, or a wrong format or folder."""
+    """Raise ValueError, or MissingPackagesError, before the work starts if a figure could not be written after it.
+
+    Its format or folder may be wrong, or matplotlib not installed.
+    """
     from heliograph.disk.atomic_files import check_writable
     from heliograph.numerics.process.optional_packages import check_installed
 
@@ -94,7 +97,14 @@ def _check_figure_writable(figure: Path) -> None:
 
 
 def _find_nodes(module: Mapping[str, object], names: Sequence[str]) -> dict[str, "Node"]:
-    """Return the nodes that these names of the network's file stand for: of each a node, or a dictionary of nodes."""
+    """Return the nodes that these names of the network's file stand for, by name, as --with adds them.
+
+    A name is that of a node, or of a dictionary of nodes, which counts as all of these. `module` has what the file
+    defines.
+
+    Raises:
+        ValueError: a name that the file does not define or that is something else; two nodes of the same name.
+    """
     from difflib import get_close_matches
 
     from heliograph.numerics.check import fail, show_value
@@ -107,7 +117,8 @@ def _find_nodes(module: Mapping[str, object], names: Sequence[str]) -> dict[str,
         nodes = {str(key): node for key, node in given.items() if isinstance(node, Node)}
         if name not in module or not nodes or len(nodes) < len(given):
             close = get_close_matches(name, [key for key in module if not key.startswith("_")], 1)
-            got = show_value(value) if name in module else f"no such name{f' (closest: {close[0]!r})' if close else ''}"
+            hint = f" (closest: {close[0]!r})" if close else ""
+            got = show_value(value) if name in module else f"no such name{hint}"
             raise fail(f"--with {name}", "a heliograph.Node of the network's file, or a dictionary of nodes", got)
         if taken := [key for key in nodes if key in found]:
             raise fail("--with", "nodes of different names", f"{taken[0]!r} twice")
@@ -116,7 +127,13 @@ def _find_nodes(module: Mapping[str, object], names: Sequence[str]) -> dict[str,
 
 
 def _parse_inputs(names: Sequence[str], words: Sequence[str], steps: int) -> "np.ndarray | None":
-    """Return the inputs of all steps (steps, inputs) from a word NAME=VALUE for each; None of a plant without any."""
+    """Return the inputs of all steps (steps, inputs) from the words of --input, NAME=VALUE for each input.
+
+    An input has the same value in all steps. None is returned for a plant without inputs.
+
+    Raises:
+        ValueError: a word that cannot be read, or not one word for each of the plant's inputs (`names`).
+    """
     import numpy as np
 
     from heliograph.numerics.check import fail

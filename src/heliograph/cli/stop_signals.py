@@ -71,14 +71,16 @@ class GentleStop:
         self._handlers: dict[int, object] = {}  # of each signal before `note_next_signal_only`, to be put back
 
     def __enter__(self) -> "GentleStop":
+        """Return this object; signals have their handlers until `note_next_signal_only`."""
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        """Give the signals back the handlers that they had."""
         self._restore_handlers()
 
     @property
     def requested(self) -> bool:
-        """Return whether a signal came."""
+        """Return whether a signal to stop (Ctrl-C, SIGTERM) came since `note_next_signal_only`, or during work."""
         return bool(self._number)
 
     @property
@@ -99,7 +101,7 @@ class GentleStop:
                     signal.signal(number, self._note_signal)
 
     def raise_if_requested(self) -> None:
-        """Raise KeyboardInterrupt if a signal came."""
+        """Raise KeyboardInterrupt if a signal to stop was noted: work that may stop here does."""
         if self._number:
             raise KeyboardInterrupt
 
@@ -120,12 +122,12 @@ class GentleStop:
         return None
 
     def _raise_on_signal(self, number: int, _: FrameType | None) -> NoReturn:
-        """Note a signal, and end what is running."""
+        """Handle a signal during `run_unless_stopped`: note it, and end the work by KeyboardInterrupt."""
         self._number = self._number or number
         raise KeyboardInterrupt
 
     def _note_signal(self, number: int, _: FrameType | None) -> None:
-        """Note a signal; the next one has its effect of before."""
+        """Handle a signal after `note_next_signal_only`: note it and go on; the next one has its usual effect."""
         self._number = self._number or number
         self._restore_handlers()
 

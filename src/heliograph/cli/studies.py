@@ -212,13 +212,13 @@ def list_studies(kind: str) -> dict[str, EntryPoint]:
 
 
 def load_study(entry: EntryPoint) -> Study:
-    """Load the study of an entry point."""
+    """Return the study that an entry point of an installed package names; its module is imported."""
     study: Study = entry.load()
     return study
 
 
 def print_studies(kind: str) -> None:
-    """Print the studies of a kind, with the first line of each docstring."""
+    """Print the studies of a kind, "publication" or "example", each with the first line of its module's docstring."""
     known = list_studies(kind)
     width = max(map(len, known), default=0)
     for name, entry in known.items():

@@ -53,7 +53,7 @@ class EngineChoice(NamedTuple):
         return f"native: {self.code.operations} operations{divisions}"
 
     def results(self) -> PyTree:
-        """Run the code on the arrays."""
+        """Return the results of the native code for the arrays."""
         return self.code(*self.arrays)
 
 
@@ -184,22 +184,19 @@ def map_arrays(change: Callable[[np.ndarray], np.ndarray], results: PyTree) -> P
 
 
 def compile_on_call(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile a function that is called now and then, once per structure and shapes of its arguments.
+    """Return a function that computes the same by compiled code, made once per structure and shapes of its arguments.
 
-    There are two compilers. Straightline's native code costs little per call, and computes the function if it is short;
-    JAX's XLA computes it otherwise. Both compute in double precision, and return NumPy arrays. Inside a trace of JAX
-    the function itself is called. If all its arguments are traced, it is traced once for equal structures and shapes,
-    so that a step alone and a loop over rows share one trace, which saves time.
+    It is for functions that users call now and then, such as one step of a filter. There are two compilers: native code
+    (the package straightline) costs little per call, and computes functions of at most SHORT operations; XLA computes
+    longer ones. Both compute in double precision, and return NumPy arrays. Each keeps its code in a cache, also what
+    `_trace_once` returns. Inside a trace of JAX the function itself is called, or where all arguments are traced one
+    stored trace of it, so that a step alone and a loop over rows share the trace, which saves time.
     """
     by_xla = float64.compile_in_float64(function)
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
-        """Compute the function by native code, or by XLA where native code does not apply.
-
-        Native code takes known arguments and a function of at most SHORT operations. Where all arguments are traced,
-        the function is traced too, once for each structure. `by_xla`, the function compiled by XLA, takes all else.
-        """
+        """Return the function's results for these arguments, by one of the ways that `compile_on_call` says."""
         # All arguments traced: the operations of one stored trace. Some of them traced, or keywords: XLA's function.
         leaves, structure = jax.tree.flatten(args)
         are_all_traced = bool(leaves) and all(isinstance(leaf, jax.core.Tracer) for leaf in leaves)
@@ -227,6 +224,7 @@ def _trace_once(function: Callable[P, R], structure: Any, settings: object) -> C
     """
 
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        """Return the function's results: a new function, so that JAX keeps its traces apart from others'."""
         return function(*args, **kwargs)
 
     program: Callable[P, R] = jax.jit(call)
@@ -395,6 +393,6 @@ def _put_in_tree(structure: Any, leaves: Sequence[Any], values: Sequence[Any]) -
 
 
 def _make_examples(arrays: Sequence[_ArrayOfRun]) -> list[Any]:
-    """Return placeholders of arrays of these shapes and types."""
+    """Return JAX's placeholders for arrays of these shapes and types, by which a compiler traces a function."""
     placeholder: Any = jax.ShapeDtypeStruct
     return [placeholder(array.shape, array.dtype) for array in arrays]

@@ -110,7 +110,10 @@ def write_filter_files(
     size: bool = False,
     window: int | None = None,
 ) -> Exported:
-    """Write as `export_c`, with the names `received` for the components of z; the arguments are those of `export_c`."""
+    """Write a filter as two files of C, and return what was written, as `export_c` does for a user's filter.
+
+    `received` are the names of the measurement's components; the other arguments are those of `export_c`.
+    """
     source = check_source_path(path)
     if precision not in PRECISIONS:
         raise fail("precision", " or ".join(PRECISIONS), show_value(precision))
@@ -204,7 +207,15 @@ class StepCost(NamedTuple):
 
 
 def measure_step_cost(header: Path, source: Path, received: int, inputs: int, real: Real) -> StepCost:
-    """Return the bytes of code and the time of a step, compiled in a temporary folder."""
+    """Return the bytes of code and the time of a step, compiled and timed in a temporary folder.
+
+    Args:
+        header: the exported header.
+        source: the exported source.
+        received: count of the measurement's components.
+        inputs: count of inputs.
+        real: type of numbers in C.
+    """
     compiler = shutil.which(COMPILER)
     if compiler is None:
         return StepCost(code_bytes=None, nanoseconds=None)

@@ -1,7 +1,7 @@
 """Text of the functions of an exported step: whole, or its prediction, its correction and a start apart."""
 
 from heliograph.export.step_parts import PartOfStep
-from heliograph.export.step_program import Real, StepProgram
+from heliograph.export.step_program import CFunction, Real, StepProgram
 
 
 def list_signatures(program: StepProgram, prefix: str, real: Real) -> list[str]:
@@ -38,7 +38,7 @@ def declare_innovation(program: StepProgram, prefix: str, real: Real) -> str:
 
 
 def explain_separate_functions(program: StepProgram, prefix: str) -> list[str]:
-    """Return lines for the header on the functions that are apart."""
+    """Return lines for the header's comment on prediction, correction and a start as functions of their own."""
     lines = [
         "",
         f"{prefix}_step is {prefix}_predict and {prefix}_correct, which may be called apart: predict at each step of",
@@ -91,17 +91,17 @@ def generate_c_functions(program: StepProgram, prefix: str, real: Real) -> list[
         "    *state = after;",
         "    return 0;",
     ]
-    start = [] if program.start_at is None else [_generate_start_statements(program, prefix)]
+    start = [] if program.start_at is None else [_generate_start_statements(program, program.start_at, prefix)]
     return [_join_function(head, body) for head, body in zip(heads, [*start, predict, correct, step], strict=True)]
 
 
 def _join_function(head: str, body: list[str]) -> str:
-    """Return the text of a function from its head and the lines of its body."""
+    """Return the text of a C function from its head and the lines of its body."""
     return "\n".join([head, "{", *body, "}"])
 
 
 def _generate_measurement_check(program: StepProgram) -> list[str]:
-    """Return the statements that refuse infinite components of a measurement."""
+    """Return the C statements that refuse a measurement with an infinite component: they return 1."""
     return [f"    if (isinf(z[{i}]) != 0) {{ return 1; }}" for i in range(program.filter.received)]
 
 
@@ -184,17 +184,17 @@ def _generate_step_number_expression(program: StepProgram, part: PartOfStep) -> 
     return "state->step"
 
 
-def _generate_start_statements(program: StepProgram, prefix: str) -> list[str]:
+def _generate_start_statements(program: StepProgram, start: CFunction, prefix: str) -> list[str]:
     """Return the C statements of a function that starts a filter from a given mean and covariance.
 
-    It returns 0, or the error code 7 if mean or covariance are invalid: the generated start then sets the flag `none`
-    to 1. The new state `after` is copied to the caller's `*state` only if it is valid.
+    It returns 0, or the error code 7 if mean or covariance are invalid: `start`, the C function that makes the state,
+    then sets the flag `none` to 1. The new state `after` is copied to the caller's `*state` only if it is valid.
     """
     members = ", ".join(f"after.{member.name}" for member in program.members)
     return [
         f"    {prefix}_state after;",
         "    unsigned char none[1];",
-        f"    {program.start_at.name}(mean, covariance, {members}, none);",
+        f"    {start.name}(mean, covariance, {members}, none);",
         "    if (none[0] != 0U) { return 7; }",
         *(["    after.step = 0;"] if program.counts else []),
         "    *state = after;",

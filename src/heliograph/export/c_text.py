@@ -1,7 +1,7 @@
 """Text of the two files of an exported step: a header with explanations, and a source that computes."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import heliograph
 from heliograph.disk.quoted_text import visible
@@ -13,7 +13,7 @@ from heliograph.export.c_functions import (
 )
 from heliograph.export.late_measurement_window import WindowText, generate_window_code
 from heliograph.export.single_precision_notes import explain_ranges, explain_rounding
-from heliograph.export.step_program import Real, StepProgram
+from heliograph.export.step_program import CFunction, Real, StepProgram
 from heliograph.export.struct_layout import lay_out_array, lay_out_struct
 from heliograph.filters.base import AbstractFilter
 from heliograph.model.estimate import Claim
@@ -63,59 +63,100 @@ def generate_header_and_source(program: StepProgram, form: CTextOptions) -> CTex
         form: the prefix of all names, the C type of numbers (`real`), the names of z's components, a description, and
             how many steps late a measurement may be (`late`; None for none).
     """
+    fields = _list_state_fields(program)
+    counter = [lay_out_array("int64_t", 1)] if program.counts else []  # the number of the step
+    state_layout = lay_out_struct([*(lay_out_array(field.type, field.length) for field in fields), *counter])
+    # What the files have for measurements that come late: nothing, unless these are taken.
+    window = WindowText(comment=[], types="", heads=[], functions=[], size=state_layout.size)
+    if form.late is not None:
+        window = generate_window_code(program, form.late, state_layout, form.prefix, form.real)
+    return CText(
+        header=_generate_header(program, form, fields, window),
+        source=_generate_source(program, form, window),
+        operations=program.operations,
+        state_bytes=window.size,
+    )
+
+
+class StateField(NamedTuple):
+    """A member of the struct in which C holds a filter's state: an array of `length` numbers of a C type."""
+
+    type: str
+    name: str
+    length: int
+
+
+def _list_state_fields(program: StepProgram) -> list[StateField]:
+    """Return the members of the state's struct but for the step counter, in order.
+
+    A step returns the new value of the member "x" as its result "next_x", of the same type. C has no arrays of length
+    0: an empty one has one number.
+    """
+    results = program.computes[0].results  # of the whole step, or of the prediction
+    types = {result.name.removeprefix("next_"): result.type for result in results}
+    return [StateField(types[m.name], m.name, max(m.start.size, 1)) for m in program.members]
+
+
+def _generate_source(program: StepProgram, form: CTextOptions, window: WindowText) -> str:
+    """Return the text of the source: first the functions that only compute, then those that a device calls.
+
+    Args:
+        program: the filter's step, as functions of C.
+        form: the prefix of all names, the C type of numbers, and a description of the filter.
+        window: the functions for measurements that come late, if there are any.
+    """
     prefix, real = form.prefix, form.real
-    # The struct of the state: (C type, name, count of numbers) of each member, then the step's number. The type of a
-    # member is that of the result "next_<member>" of a step. C has no arrays of length 0: an empty one has one number.
-    types = {x.name.removeprefix("next_"): x.type for x in program.computes[0].results}
-    fields = [(types[m.name], m.name, max(m.start.size, 1)) for m in program.members]
-    counter = [lay_out_array("int64_t", 1)] if program.counts else []
-    state_layout = lay_out_struct([*(lay_out_array(kind, count) for kind, _, count in fields), *counter])
-    window = None if form.late is None else generate_window_code(program, form.late, state_layout, prefix, real)
-    # The source has the functions that compute, then those that a device calls.
+    # Functions that make the first state, and the state of a given mean and covariance where a filter can have it.
     starts = [program.initial] if program.start_at is None else [program.initial, program.start_at]
-    source = _SOURCE.format(
+    return _SOURCE.format(
         prefix=prefix,
         comment=f"{prefix}.c: one step of {form.kind}; {prefix}.h says how to use it.",
         functions="\n\n".join(_generate_static_function(code) for code in (*starts, *program.computes)),
         start=_generate_initial_state_statements(program),
-        step="\n\n".join([*generate_c_functions(program, prefix, real), *([] if window is None else window.functions)]),
+        step="\n\n".join([*generate_c_functions(program, prefix, real), *window.functions]),
         mean=program.mean,
         covariance=program.covariance,
         real=real,
     )
-    # The header declares the state and explains the functions.
-    heads = [*list_signatures(program, prefix, real), *([] if window is None else window.heads)]
-    header = _HEADER.format(
+
+
+def _generate_header(program: StepProgram, form: CTextOptions, fields: Sequence[StateField], window: WindowText) -> str:
+    """Return the text of the header, which explains the functions and declares them and the state.
+
+    Args:
+        program: the filter's step, as functions of C.
+        form: the prefix of all names, the C type of numbers, the names of z's components, and a description.
+        fields: members of the state's struct, but for the step counter.
+        window: the functions for measurements that come late, if there are any.
+    """
+    prefix, real = form.prefix, form.real
+    members = [f"    {field.type} {field.name}[{field.length}];" for field in fields]
+    heads = [*list_signatures(program, prefix, real), *window.heads]
+    return _HEADER.format(
         prefix=prefix,
         guard=f"{prefix.upper()}_H",
         comment=_generate_header_comment(program, form, window),
-        members="\n".join([f"    {kind} {name}[{count}];" for kind, name, count in fields] + _declare_counter(program)),
+        members="\n".join([*members, *_declare_counter(program)]),
         innovation=declare_innovation(program, prefix, real),
-        window="" if window is None else window.types,
+        window=window.types,
         functions="".join(f"{head};\n" for head in heads),
         real=real,
     )
-    return CText(
-        header=header,
-        source=source,
-        operations=program.operations,
-        state_bytes=state_layout.size if window is None else window.size,
-    )
 
 
-def _generate_static_function(code: Any) -> str:
-    """Return the text of a function that only this file knows."""
-    text: str = code.definition
-    return text.replace(f"void {code.name}(", f"static void {code.name}(", 1)
+def _generate_static_function(code: CFunction) -> str:
+    """Return the text of a function of C as one that only its file knows ("static")."""
+    definition: str = code.definition
+    return definition.replace(f"void {code.name}(", f"static void {code.name}(", 1)
 
 
 def _declare_counter(program: StepProgram) -> list[str]:
-    """Return the line that declares the step counter in the state; none where steps are not counted."""
+    """Return the line that declares the step counter in the state's struct; none where steps are not counted."""
     return ["    int64_t step;"] if program.counts else []
 
 
 def _generate_initial_state_statements(program: StepProgram) -> str:
-    """Return the statements that set the state before the first step."""
+    """Return the C statements that set each member of `state` to its numbers before the first step."""
     members = ", ".join(f"state->{m.name}" for m in program.members)
     return f"    {program.initial.name}({members});" + ("\n    state->step = 0;" if program.counts else "")
 
@@ -125,13 +166,13 @@ def find_claim_at_precision(filter: AbstractFilter, real: Real) -> Claim:
     return filter.claim if real == "double" or filter.claim == "none" else "nominal"
 
 
-def _generate_header_comment(program: StepProgram, form: CTextOptions, window: WindowText | None) -> str:
+def _generate_header_comment(program: StepProgram, form: CTextOptions, window: WindowText) -> str:
     """Return the comment at the head of the header: how to call the functions, and what the arrays hold.
 
     Args:
         program: the filter's step, as functions of C.
         form: the prefix of all names, the C type of numbers (`real`), the names of z's components, and a description.
-        window: the functions for measurements that come late; None where there are none.
+        window: the functions for measurements that come late, if there are any, with lines that explain them.
     """
     filter, prefix, claim = program.filter, form.prefix, find_claim_at_precision(program.filter, form.real)
     # Beside each measurement, the range of single precision; "" in double.
@@ -150,7 +191,7 @@ def _generate_header_comment(program: StepProgram, form: CTextOptions, window: W
         "bits (of its unit, a thousandth or a millionth), or a function of the inputs returned no finite numbers, or",
         "no covariance.",
         *(explain_separate_functions(program, prefix) if len(program.parts) > 1 else []),
-        *([] if window is None else window.comment),
+        *window.comment,
         "",
         *_explain_entries("z", form.received, ranges),
         *_explain_entries("u", filter.inputs, [""] * len(filter.inputs)),

@@ -23,7 +23,9 @@ DIGITS = {"double": float(np.finfo(np.float64).eps), "float": float(np.finfo(np.
 
 
 class LateMeasurementWindow(NamedTuple):
-    """Rows that are held for late measurements.
+    """Sizes of the memory in which exported C code holds its newest steps, for measurements that come late.
+
+    A row is a step: the state before it, its measurement and its inputs.
 
     Args:
         steps: how many rows before the newest one a measurement may be late.
@@ -76,7 +78,10 @@ def check_and_count_window_steps(filter: AbstractFilter, steps: object) -> int:
 
 
 class WindowText(NamedTuple):
-    """What a window adds to the files: lines of the comment, types, heads and functions; and its bytes."""
+    """What late measurements add to the C files: lines of the comment, types, heads and functions.
+
+    `size` is how many bytes a device holds: of the window, or of the state alone where there is no window.
+    """
 
     comment: list[str]
     types: str
@@ -86,13 +91,14 @@ class WindowText(NamedTuple):
 
 
 def generate_window_code(program: StepProgram, steps: int, state: StructLayout, prefix: str, real: Real) -> WindowText:
-    """Return the C text of the window: the newest rows, stored so that a late measurement can be filtered in its place.
+    """Return the C text of a window: memory of the newest steps, so that a late measurement is filtered in its place.
 
-    The plant counts steps, or has a time step among its inputs. The window keeps the state before each row, and the
-    row's measurement and inputs: with a late value in its row, the filter is run again from there.
+    A row of the window is a step: the state before it, its measurement and its inputs. A late measurement is put into
+    the row of its time, and the filter is run again from that row on. How late it is, is given as a number of steps;
+    or if the time step is an input of the plant (TIME_STEP, "dt"), as an age, and then a row may be added for it.
 
     Args:
-        program: the step, as functions of C.
+        program: the filter's step, as functions of C.
         steps: how many rows before the newest one a measurement may be late.
         state: size and alignment in bytes of the filter's state.
         prefix: beginning of all C names.
@@ -102,12 +108,15 @@ def generate_window_code(program: StepProgram, steps: int, state: StructLayout, 
     inputs, received = filter.inputs, filter.received
     index_of_time = inputs.index(TIME_STEP) if TIME_STEP in inputs else None
     window = LateMeasurementWindow(steps=steps, time=index_of_time, received=received, inputs=len(inputs))
-    # The struct: the present state, rows of a state with the measurement and the inputs after it, and the four counters
-    # of `_declare_window`. C has no arrays of length 0.
+    # Bytes of the structs that `_declare_window` writes. A row: a state, a measurement and inputs; C has no arrays of
+    # length 0, so that none is one number.
     data = [lay_out_array(real, max(count, 1)) for count in (received, len(inputs))]
     row = lay_out_struct([state, *data])
+    # The window: the present state, the rows, and four counters: the place of the oldest row, the number of rows, and
+    # how many measurements were refused as too late (`late`) or as there already (`held`).
+    rows = StructLayout(window.capacity * row.size, row.alignment)
     counters = [lay_out_array("uint32_t", 1)] * 4
-    whole = lay_out_struct([state, StructLayout(window.capacity * row.size, row.alignment), *counters])
+    whole = lay_out_struct([state, rows, *counters])
     return WindowText(
         comment=_explain_window(window, prefix, whole.size),
         types=_declare_window(window, prefix, real),
@@ -129,7 +138,7 @@ def _list_function_heads(window: LateMeasurementWindow, prefix: str, real: Real)
 
 
 def _declare_window(window: LateMeasurementWindow, prefix: str, real: Real) -> str:
-    """Return the declarations of a row and of the window."""
+    """Return the C declarations of two structs: a row (one step), and the window of all rows with its counters."""
     received, inputs = max(window.received, 1), max(window.inputs, 1)
     return f"""typedef struct {{
     {prefix}_state before;
@@ -191,7 +200,11 @@ def _explain_window(window: LateMeasurementWindow, prefix: str, bytes_held: int)
 
 
 def _generate_window_functions(window: LateMeasurementWindow, prefix: str, real: Real) -> list[str]:
-    """Return the text of the window's functions, and of those that they share."""
+    """Return the text of the window's C functions, made from the templates below.
+
+    The names that the templates leave open are the prefix p of all names in C, counts of rows, and statements that
+    depend on the lengths of measurement and inputs.
+    """
     received, inputs = window.received, window.inputs
     missing = " && ".join(f"(isnan(z[{i}]) != 0)" for i in range(received)) or "1"
     nothing = f"    if ({missing}) {{ return 0; }} /* nothing arrived */"
@@ -220,7 +233,7 @@ def _generate_array_copy(target: str, source: str, count: int) -> str:
 
 
 def _format_literal(number: float, real: Real) -> str:
-    """Return a literal of the type."""
+    """Return a number as a literal of C of the type `real`; one of float ends in f."""
     return f"{number:.3e}" + ("f" if real == "float" else "")
 
 

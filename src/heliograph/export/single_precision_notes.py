@@ -74,6 +74,6 @@ def _find_noise_deviations(filter: AbstractFilter) -> np.ndarray | None:
 
 
 def _round_down(number: float) -> float:
-    """Return a positive number to two digits, not above it."""
+    """Return a positive number rounded down to two digits, such as 0.012 for 0.0129."""
     unit = 10.0 ** (math.floor(math.log10(number)) - 1)
     return math.floor(number / unit) * unit

@@ -38,55 +38,45 @@ class PartOfStep(NamedTuple):
 
 
 def make_parts_of_step(filter: AbstractFilter, real: str, apart: bool) -> list[PartOfStep]:
-    """Return the functions to export: one step or, if `apart`, prediction and correction, for numbers of type `real`.
+    """Return the functions of a filter that are exported to C: its step or, if `apart`, prediction and correction.
 
-    C code is later written from these JAX functions. Each has example arguments, whose shapes alone count, and the
-    names of its results `other_results` state and estimate: "implausible" says that the estimate lost its digits and
-    must not be used, "spoilt" that an input has too few digits.
+    They are functions of JAX on arrays, which JAX traces and from which C is then written. Each is returned with its
+    name, the names of its data, example arguments, of which the trace takes shapes and types alone, and the names of
+    its results after the state's arrays, the mean and the covariance, in the order in which it returns them.
 
     Args:
         filter: the filter.
-        real: "double" or "float".
-        apart: whether prediction and correction are functions of their own.
+        real: type of numbers in C, "double" or "float", by whose rounding data are judged.
+        apart: whether prediction and correction are two functions; else the whole step is one.
     """
-    # Examples: the arrays of the state, a measurement, inputs and the number of a step.
-    leaves, tree = jax.tree.flatten(filter.init())
+    # Examples: the arrays of the state, a measurement z, inputs u and the number k of a step.
+    state_arrays, structure = jax.tree.flatten(filter.init())
     z, u, k = np.zeros(filter.received), np.zeros(len(filter.inputs)), np.asarray(0)
+    # Flags: data are so far off that the estimate would lose its digits; an input has too few digits itself.
     flags = ("implausible", "spoilt")
     if not apart:
-        return [
-            PartOfStep(
-                "step",
-                ("z", "u"),
-                _make_step_function(filter, tree, real),
-                examples=(leaves, z, u, k),
-                other_results=flags,
-            )
-        ]
-    # Make one correction, to see whether the filter weighs components.
+        step = _make_step_function(filter, structure, real)
+        return [PartOfStep("step", ("z", "u"), step, examples=(state_arrays, z, u, k), other_results=flags)]
+    # A robust filter also returns how much of each component it used, its weights: one correction shows whether it
+    # does.
     _state, innovation = filter.correct(filter.predict(filter.init(), u, 0), z, 0)
-    has_weights = innovation.weight is not None
-    results_of_correction = ("implausible", "value", "nis", "arrived", *(("weight",) if has_weights else ()))
+    weights = () if innovation.weight is None else ("weight",)
+    of_innovation = ("value", "nis", "arrived", *weights)
+    predict = _make_prediction_function(filter, structure, real)
+    correct = _make_correction_function(filter, structure, real)
     return [
+        PartOfStep("predict", ("u",), predict, examples=(state_arrays, u, k), other_results=flags),
         PartOfStep(
-            "predict",
-            ("u",),
-            _make_prediction_function(filter, tree, real),
-            examples=(leaves, u, k),
-            other_results=flags,
-        ),
-        PartOfStep(
-            "correct",
-            ("z",),
-            _make_correction_function(filter, tree, real),
-            examples=(leaves, z, k),
-            other_results=results_of_correction,
+            "correct", ("z",), correct, examples=(state_arrays, z, k), other_results=("implausible", *of_innovation)
         ),
     ]
 
 
 def _make_step_function(filter: AbstractFilter, tree: PyTree, real: str) -> Callable[..., list[jax.Array]]:
-    """Return the function of a whole step; `tree`: structure of a state, of which C has the arrays of type `real`."""
+    """Return the function of a whole step on arrays, from which C is written.
+
+    `tree` is the structure of the filter's state, of which C holds the arrays, and `real` the type of numbers in C.
+    """
 
     @jax.jit
     def step(arrays: list[jax.Array], z: jax.Array, u: jax.Array, k: jax.Array) -> list[jax.Array]:
@@ -105,7 +95,10 @@ def _make_step_function(filter: AbstractFilter, tree: PyTree, real: str) -> Call
 
 
 def _make_prediction_function(filter: AbstractFilter, tree: PyTree, real: str) -> Callable[..., list[jax.Array]]:
-    """Return the function of the prediction alone; `tree` is the structure of a state."""
+    """Return the function of the prediction alone on arrays, from which C is written.
+
+    `tree` is the structure of the filter's state, of which C holds the arrays, and `real` the type of numbers in C.
+    """
 
     @jax.jit
     def predict(arrays: list[jax.Array], u: jax.Array, k: jax.Array) -> list[jax.Array]:

@@ -1,7 +1,7 @@
 """One step of a filter as functions of C: from state, measurement and inputs to the state after, and to flags."""
 
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +17,9 @@ from heliograph.numerics.types import PyTree
 from straightline import Unsupported, to_c
 
 Real = Literal["double", "float"]
+# What `straightline.to_c` returns: name and text (`definition`) of a function of C, what it reads (`arguments`) and
+# writes (`results`), and how often it has each operation.
+CFunction: TypeAlias = Any
 RESERVED = frozenset((
     "auto", "break", "case", "char", "const", "continue", "default", "do", "double", "else", "enum", "extern", "float",
     "for", "goto", "if", "inline", "int", "long", "register", "restrict", "return", "short", "signed", "sizeof",
@@ -54,16 +57,16 @@ class StepProgram(NamedTuple):
     members: list[StateMember]
     read: list[StateMember]
     parts: list[PartOfStep]
-    computes: list[Any]
-    initial: Any
-    start_at: Any
+    computes: list[CFunction]
+    initial: CFunction
+    start_at: CFunction | None
     mean: str
     covariance: str
     counts: bool
 
     @property
     def operations(self) -> dict[str, int]:
-        """Return the number of each operation in a step."""
+        """Return how often each operation, such as "mul", is in the functions of a step; in a loop it counts once."""
         counts = [code.operations for code in self.computes]
         return {op: sum(count.get(op, 0) for count in counts) for every in counts for op in every}
 
@@ -135,7 +138,7 @@ def _make_state_members(state: PyTree, estimate: Estimate) -> tuple[list[StateMe
     return of_state, of_estimate
 
 
-def _find_same_result(number: int, parts: Sequence[Any], named: Sequence[StateMember]) -> int:
+def _find_same_result(number: int, parts: Sequence[CFunction], named: Sequence[StateMember]) -> int:
     """Return the number of the first array of the state that always equals array `number`, or `number` itself.
 
     Two arrays are always equal if they are so at the start (`named`) and after each of the `parts`: results[n].same is
@@ -154,7 +157,7 @@ def _lower_part_to_c(
     size: bool = False,
     kept: Sequence[int] | None = None,
     names: tuple[Sequence[StateMember], Sequence[StateMember]] = ((), ()),
-) -> Any:
+) -> CFunction:
     """Lower a part of a step from JAX to a function of C and return that; all arguments but the measurement are finite.
 
     Args:
@@ -194,7 +197,7 @@ def _lower_part_to_c(
     )
 
 
-def _lower_start_to_c(filter: AbstractFilter, kept: list[int], names: list[str], prefix: str, real: Real) -> Any:
+def _lower_start_to_c(filter: AbstractFilter, kept: list[int], names: list[str], prefix: str, real: Real) -> CFunction:
     """Lower to C, and return, the function that makes the members of a state from a mean and a covariance.
 
     Members are the arrays of the filter's state as a C struct. The last result, `none`, is a flag: the arguments are no
@@ -258,7 +261,7 @@ def _find_symmetric_arrays(parts: Sequence[PartOfStep]) -> set[int]:
 
 
 def make_unsupported_error(operation: str, where: str) -> InputError:
-    """Return an error, in one line, about an operation that cannot be exported."""
+    """Return the error of an operation that C does not have: its name, and the line of code that it comes from."""
     return fail("export", "operations that C has", f"{operation} at {where}")
 
 
@@ -279,5 +282,5 @@ def name_state_arrays(state: PyTree) -> list[str]:
 
 
 def _is_symmetric(value: np.ndarray) -> bool:
-    """Return whether an array is a symmetric matrix of more than one row."""
+    """Return whether an array is a symmetric matrix; a matrix of one row, which has no pairs of entries, is none."""
     return value.ndim == 2 and len(value) > 1 and np.array_equal(value, value.T)

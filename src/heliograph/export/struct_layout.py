@@ -8,14 +8,14 @@ BYTES = {"double": 8, "float": 4, "unsigned char": 1, "int32_t": 4, "uint32_t": 
 
 
 class StructLayout(NamedTuple):
-    """Bytes of a type of C, and of which number its address is a multiple."""
+    """Size of a type of C in bytes, and the number of bytes that its address is a multiple of."""
 
     size: int
     alignment: int
 
 
 def lay_out_array(type: str, count: int) -> StructLayout:
-    """Return the layout of an array of numbers."""
+    """Return the layout of an array of `count` numbers of a C type, such as "double"."""
     return StructLayout(BYTES[type] * count, BYTES[type])
 
 

@@ -19,8 +19,8 @@ T = TypeVar("T")
 def cache_by_object(function: Callable[Concatenate[S, P], T]) -> Callable[Concatenate[S, P], T]:
     """Decorate a function: its results are cached for each object that is its first argument, while the object lives.
 
-    An object is identified by `id`, so that nothing is compared. Cached arrays are made read-only, since all callers
-    share them; traced results are never cached.
+    An object is identified by `id`, so that nothing is compared: it must not change. The other arguments must have
+    hashes. Cached arrays are made read-only, since all callers share them; results that JAX traces are never cached.
     """
     # By identity of the object: a weak reference to it, and the results by the other arguments.
     cache: dict[int, tuple[ref[S], dict[Hashable, T]]] = {}
@@ -31,8 +31,9 @@ def cache_by_object(function: Callable[Concatenate[S, P], T]) -> Callable[Concat
         """Return the result for this object and these arguments, computed only once while the object lives."""
         if not positional and first_parameter not in named:
             return function(*positional, **named)  # which raises an error that says what is missing
-        owner, others = (positional[0], positional[1:]) if positional else (named.pop(first_parameter), ())
-        identity, key = id(owner), (others, tuple(named.items()))
+        owner, *others = positional or (named.pop(first_parameter),)
+        identity = id(owner)
+        key = (tuple(others), tuple(named.items()))  # of the other arguments
         _reference, results = cache.get(identity, (None, {}))
         if key in results:
             return results[key]
@@ -87,6 +88,6 @@ def cache_arrays(function: Callable[P, T]) -> Callable[P, T]:
 
 
 def _make_read_only(leaf: Any) -> None:
-    """Make an array read-only; leave all else as it is."""
+    """Make a leaf of a cached result read-only if it is a NumPy array, since all callers share it."""
     if isinstance(leaf, np.ndarray):
         leaf.setflags(write=False)

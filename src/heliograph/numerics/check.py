@@ -50,17 +50,26 @@ def error_text(error: Exception) -> str:
 
 
 def array(name: str, value: ArrayLike, shape: tuple[int | str | None, ...], missing: bool = False) -> Any:
-    """Return `value` as a float64 array of the given shape, NaN where it is masked; a traced one keeps its precision.
+    """Return a user's value as a float64 array of the given shape, NaN where it is masked; raise ValueError for others.
 
-    A length in the shape is free if it is None, or a name for errors. Numbers must be real and finite; with `missing`
-    they may be NaN, for a number that did not arrive. Of a traced array only the shape is checked.
+    Numbers must be real and finite. An array that JAX traces, of which the numbers are not known, keeps its precision,
+    and only its shape is checked.
+
+    Args:
+        name: what an error calls the value.
+        value: numbers in any form that NumPy makes an array of.
+        shape: the length of each axis; any length where it is None, or a text, which errors show in its place.
+        missing: whether numbers may be NaN, for what did not arrive.
     """
     report_domain(name, value, REAL)
     return check_numbers(name, _read_numbers(name, value), shape, missing)
 
 
 def check_numbers(name: str, numbers: Any, shape: tuple[int | str | None, ...], missing: bool = False) -> Any:
-    """Return an array of numbers that has the shape, and finite ones as `array` says; not a copy of it."""
+    """Return an array as it is, not a copy, if it has the shape and its numbers are finite; raise ValueError if not.
+
+    The arguments are those of `array`. Of an array that JAX traces only the shape is checked.
+    """
     fixed = [(axis, length) for axis, length in enumerate(shape) if isinstance(length, int)]
     if numbers.ndim != len(shape) or any(numbers.shape[axis] != length for axis, length in fixed):
         raise fail(name, _describe_shape(shape, numbers.ndim), f"shape {numbers.shape}")
@@ -78,7 +87,7 @@ def check_numbers(name: str, numbers: Any, shape: tuple[int | str | None, ...], 
 
 
 def _describe_shape(shape: tuple[int | str | None, ...], dimensions: int) -> str:
-    """Return a shape in words, with an example if an array of fewer dimensions came."""
+    """Return an expected shape in words, for an error, with an example if an array of fewer `dimensions` came."""
     if shape == (None,):
         return "a list of numbers, such as [1, 0]"
     words = ("rows", "columns") if len(shape) == 2 else ("any",) * len(shape)  # for lengths that are free
@@ -88,9 +97,10 @@ def _describe_shape(shape: tuple[int | str | None, ...], dimensions: int) -> str
 
 
 def check_columns(name: str, table: object, names: Sequence[str] = ()) -> None:
-    """Raise ValueError if a table's names contradict an array's (one twice, another order), or its numbers are packed.
+    """Raise ValueError if a table's columns have a name twice, or the `names` in another order, or packed numbers.
 
-    Only texts count as names. An array, or a table whose columns have numbers, has none.
+    Packed numbers, as files of NetCDF have them, are codes that the reader should have decoded. Only texts count as
+    names: an array, or a table whose columns have numbers, has none.
     """
     if packing := find_packing(table):
         raise fail(name, "decoded numbers, as xarray.decode_cf makes them", f"an array with the attribute {packing!r}")
@@ -105,7 +115,10 @@ def check_columns(name: str, table: object, names: Sequence[str] = ()) -> None:
 
 
 def _read_numbers(name: str, value: ArrayLike) -> Any:
-    """Return real numbers as an array of doubles, traced ones as they are; raise one line of anything else."""
+    """Return a user's real numbers as an array of doubles, or as JAX traces them; raise ValueError for anything else.
+
+    Masked numbers become NaN. Whole numbers and flags that are traced become floats.
+    """
     traced = is_traced(value)
     if not traced:
         check_columns(name, value)
@@ -137,7 +150,7 @@ def scalar(name: str, value: ArrayLike, low: float = -np.inf, high: float = np.i
 
 
 def _describe_range(low: float, high: float) -> str:
-    """Return in words which numbers lie between two limits."""
+    """Return in words, for an error, which numbers lie between two limits, either of which may be infinite."""
     if 0 < low <= TINY:  # the least positive double: a bound that says no more than "positive"
         return "a positive number" + (f" up to {high:g}" if high < np.inf else "")
     return f"a number of at least {low:g}" if high == np.inf else f"a number from {low:g} to {high:g}"
@@ -184,7 +197,7 @@ def function(name: str, value: object, of: str) -> Any:
 
 
 def check_progress(value: object, of: str) -> None:
-    """Raise ValueError unless progress can be reported: by a function, or to nobody."""
+    """Raise ValueError unless `value` can report progress: a function of `of`, or None for no reports."""
     if value is not None:
         function("progress", value, of)
 
@@ -212,12 +225,12 @@ def flag(name: str, value: object) -> bool:
 
 
 def text(name: str, value: object) -> str:
-    """Return a value that is a text, or raise."""
+    """Return the value if it is a text; raise ValueError, which names it, for anything else."""
     return instance(name, value, str, "a text")
 
 
 def repeat_per_step(name: str, value: ArrayLike, count: int) -> np.ndarray:
-    """Return a number for each of `count` steps, from one for all or one each."""
+    """Return numbers (count,), one for each step, from one number for all steps or a list of one for each."""
     numbers: np.ndarray = np.broadcast_to(array(name, value, (count,) if rank(name, value) else ()), (count,))
     return numbers
 

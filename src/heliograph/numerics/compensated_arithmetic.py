@@ -67,10 +67,13 @@ def compensate(function: Callable[[jax.Array], jax.Array], unit: float) -> Calla
 
 
 class _CompensatedEvaluation:
-    """Evaluation of a traced program in numbers that are high + low."""
+    """Evaluation of a traced program in numbers high + low: the rounded value, and what rounding took of it."""
 
     def __init__(self, unit: float):
-        """Choose splitter, type and rules for a precision with rounding `unit`, which is 2^-53 for doubles."""
+        """Choose what depends on the precision of the evaluation, and the rules of operations.
+
+        `unit` is eps of the precision, 2^-52 for doubles. A rule returns a result high + low from arguments high + low.
+        """
         bits = 1 - round(np.log2(unit))  # bits of a number's fraction
         self.splitter = 2.0 ** ((bits + 1) // 2) + 1  # factor that splits a number into halves of its digits
         self.stored = np.float32 if bits <= 24 else np.float64
@@ -81,13 +84,19 @@ class _CompensatedEvaluation:
         }  # fmt: skip
 
     def evaluate_program(self, program: ClosedJaxpr, inputs: Sequence[Compensated]) -> list[Compensated]:
-        """Return the results of a traced program, each with what rounding lost, evaluated operation by operation."""
-        jaxpr, known = program.jaxpr, map(self._split_known, program.consts)
-        values: dict[Var, Compensated] = dict(zip(jaxpr.constvars, known, strict=True))
+        """Return the results of a program that JAX traced, evaluated operation by operation, with what rounding lost.
+
+        Each number is a pair (high, low), its rounded value and what rounding took of it; `inputs` are the arguments'.
+        A constant of the program is a double, which may have more digits than the precision of the evaluation holds:
+        the digits beyond it are its low part.
+        """
+        jaxpr = program.jaxpr
+        constants = map(self._split_known, program.consts)
+        values: dict[Var, Compensated] = dict(zip(jaxpr.constvars, constants, strict=True))
         values |= zip(jaxpr.invars, inputs, strict=True)
 
         def look_up(v: Any) -> Compensated:
-            """Return the value of a variable or of a number in the program."""
+            """Return the value of an argument of an operation: of a variable, or of a number in the program's text."""
             return self._split_known(v.val) if isinstance(v, Literal) else values[v]
 
         for equation in jaxpr.eqns:
@@ -96,7 +105,7 @@ class _CompensatedEvaluation:
         return list(map(look_up, jaxpr.outvars))
 
     def _split_known(self, number: Any) -> Compensated:
-        """Split a known real number into what the precision can hold and the rest; anything else has no rest (None)."""
+        """Return a known real number as what the precision can hold and the rest; anything else has no rest (None)."""
         if isinstance(number, jax.core.Tracer) or not np.issubdtype(np.asarray(number).dtype, np.floating):
             return Compensated(number)
         exact = np.asarray(number, np.float64)
@@ -105,9 +114,11 @@ class _CompensatedEvaluation:
         return Compensated(high, low if np.any(low) else None)
 
     def _apply_operation(self, equation: JaxprEqn, inputs: list[Compensated]) -> list[Compensated]:
-        """Return the results of one operation f; without a rule in `self.rules` it is f(high) + f'(high) low.
+        """Return the results of one operation f of a traced program, as numbers high + low.
 
-        A call of a program and a branch are evaluated inside.
+        A number is its rounded value `high` and what rounding took of it, `low`. By a rule of `self.rules`, the result
+        has the rounding error of f too. Without a rule it is f(high) with the low part f'(high) low, to first order. A
+        call of a program and a branch are evaluated operation by operation.
         """
         name, params = equation.primitive.name, equation.params
         program = called_program(equation)
@@ -120,7 +131,10 @@ class _CompensatedEvaluation:
         return _apply_to_first_order(partial(_apply_unchanged, equation), inputs, equation.primitive.multiple_results)
 
     def _apply_branches(self, inputs: list[Compensated], branches: Sequence[ClosedJaxpr]) -> list[Compensated]:
-        """Take one of several programs, each evaluated so."""
+        """Return the results of JAX's `cond`: of the branch, a program, whose number is inputs[0].
+
+        Each branch is evaluated with what rounding loses; the other inputs are the branches' arguments.
+        """
 
         def evaluate_branch(branch: ClosedJaxpr, given: list[Compensated]) -> list[Compensated]:
             """Return a branch's results; each real one gets a low part, even 0, as all branches need one structure."""
@@ -138,18 +152,19 @@ class _CompensatedEvaluation:
         return results
 
     def _add(self, a: Compensated, b: Compensated, **_: Any) -> Compensated:
-        """Add two numbers, with what the sum's rounding and theirs lost."""
+        """Return fl(a_high + b_high) and its low part: the rounding error of this sum + a_low + b_low."""
         total, error = split_sum(a.high, b.high)
         return Compensated(total, _sum_terms_present(error, a.low, b.low))
 
     def _subtract(self, a: Compensated, b: Compensated, **_: Any) -> Compensated:
-        """Subtract: add the negative."""
+        """Return a - b as a + (-b), with what rounding loses."""
         return self._add(a, Compensated(-b.high, None if b.low is None else -b.low))
 
     def _multiply(self, a: Compensated, b: Compensated, **_: Any) -> Compensated:
-        """Multiply two numbers, with what the product's rounding and theirs lost."""
+        """Return fl(a_high b_high) and its low part: the product's rounding error + a_low b_high + b_low a_high."""
         lost = [x.low * y.high for x, y in ((a, b), (b, a)) if x.low is not None]
-        return Compensated(a.high * b.high, _sum_terms_present(self._find_product_error(a.high, b.high), *lost))
+        rounding_error = self._find_product_error(a.high, b.high)
+        return Compensated(a.high * b.high, _sum_terms_present(rounding_error, *lost))
 
     def _divide(self, a: Compensated, b: Compensated, **_: Any) -> Compensated:
         """Return q = fl(a / b) and its low part (a_high - q b_high + a_low - q b_low) / b_high.
@@ -169,7 +184,7 @@ class _CompensatedEvaluation:
         return Compensated(root, _sum_terms_present(remainder, a.low) / (2 * root))
 
     def _square(self, a: Compensated, **_: Any) -> Compensated:
-        """Multiply a number by itself."""
+        """Return the product a a, with what rounding loses."""
         return self._multiply(a, a)
 
     def _raise_to_integer(self, a: Compensated, y: int, **_: Any) -> Compensated:
@@ -200,7 +215,10 @@ class _CompensatedEvaluation:
         return Compensated(jnp.stack(highs, axis), jnp.stack(lows, axis))
 
     def _multiply_matrices(self, a: Compensated, b: Compensated, dimension_numbers: Any, **_: Any) -> Compensated:
-        """Multiply matrices by the products of entries, added one after another."""
+        """Return JAX's product of arrays: products of entries, added one after another, with what rounding loses.
+
+        `dimension_numbers` says which axes of a and b are summed over, and which both share with the result.
+        """
         # Axes that are summed over, and axes of a batch; the result has the axes batch, rest of a, rest of b.
         (summed_a, summed_b), (batch_a, batch_b) = dimension_numbers
         left = _arrange_factor(a, batch_a, summed_a, left=True)
@@ -245,7 +263,7 @@ class _CompensatedEvaluation:
 
 
 def _apply_unchanged(equation: JaxprEqn, *arguments: Any) -> Any:
-    """Apply an operation as it is."""
+    """Return the results of an operation of a traced program for these arguments, as JAX computes it."""
     primitive: Any = equation.primitive
     return primitive.bind(*arguments, **equation.params)
 
@@ -302,7 +320,7 @@ def _scales_without_rounding(a: Any) -> bool:
 
 
 def _split_along_axis(a: Compensated, axis: int) -> list[Compensated]:
-    """Return the entries along an axis, each with its own low part, or None if the whole has none."""
+    """Return the slices of high + low along an axis, as numbers high + low; their low is None if the whole has none."""
     count = jnp.shape(a.high)[axis]
     highs = [_take(a.high, i, axis) for i in range(count)]
     lows = [None if a.low is None else _take(a.low, i, axis) for i in range(count)]
@@ -310,7 +328,7 @@ def _split_along_axis(a: Compensated, axis: int) -> list[Compensated]:
 
 
 def _take(x: Any, i: int, axis: int) -> Any:
-    """Return entry i along an axis; of a known array a known one."""
+    """Return entry i of an array along an axis: by JAX for its arrays, by NumPy for known ones, which stay known."""
     return lax.index_in_dim(x, i, axis, keepdims=False) if isinstance(x, jax.Array) else np.take(x, i, axis)
 
 
@@ -330,12 +348,12 @@ def _arrange_factor(a: Compensated, batch: Sequence[int], summed: Sequence[int],
 
 
 def _as_array(x: Any) -> Any:
-    """Return a part of a number as an array; None and JAX's arrays as they are."""
+    """Return the high or the low part of a number as an array; None (nothing lost) and JAX's arrays as they are."""
     return x if x is None or isinstance(x, jax.Array) else np.asarray(x)
 
 
 def _sum_terms_present(*terms: Any) -> Any:
-    """Return the sum of those terms that are not None."""
+    """Return the sum of those terms that are not None, from the left; None if all are."""
     given = [x for x in terms if x is not None]
     return reduce(lambda a, b: a + b, given) if given else None
 
@@ -346,5 +364,5 @@ def _or_zero(x: Any) -> Any:
 
 
 def _one_like(a: Compensated) -> Compensated:
-    """Return ones of a number's shape."""
+    """Return ones of the shape of a number high + low, of which nothing is lost."""
     return Compensated(jnp.ones_like(a.high))

@@ -69,11 +69,18 @@ def average_correlated(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
     if count == 1:
         return mean, float("nan")
     deviations = np.where(is_known, values - mean, 0.0)
-    # The variance of the sum of all values is sum_t (1 - |t| / width) sum_k e_k e_(k+t), with the deviations e. This
-    # equals the sum of squares of all moving sums of `width` deviations, divided by the width; 1' W 1 likewise.
     width = int(np.ceil(len(values) ** (1 / 3))) + 1
-    total, ones = (np.sum(np.convolve(x, np.ones(width)) ** 2) / width for x in (deviations, is_known.astype(float)))
-    return mean, float(np.sqrt(total * count / (count - ones / count)) / count)
+
+    def weigh(x: np.ndarray) -> float:
+        """Return x' W x = sum_t (1 - |t| / width) sum_k x_k x_(k+t), with Bartlett's weights W.
+
+        It equals the sum of squares of all moving sums of `width` numbers, divided by the width.
+        """
+        return float(np.sum(np.convolve(x, np.ones(width)) ** 2) / width)
+
+    # e' W e is the variance of the sum of all values but for the loss of the mean, n / (n - 1' W 1 / n).
+    variance_of_sum, ones = weigh(deviations), weigh(is_known.astype(float))
+    return mean, float(np.sqrt(variance_of_sum * count / (count - ones / count)) / count)
 
 
 def correlate_over_steps(
@@ -90,11 +97,13 @@ def correlate_over_steps(
         lags: number of lags.
     """
     is_known = ~np.isnan(deviations)
-    e, steps, count = np.where(is_known, deviations, 0.0), deviations.shape[1], int(is_known.sum())
+    e = np.where(is_known, deviations, 0.0)
+    steps, count = deviations.shape[1], int(is_known.sum())  # N and n
     power = float(np.sum(e**2))
-    correlations, errors = np.full(lags, np.nan), [1 / np.sqrt(max(count, 1))]
+    correlations = np.full(lags, np.nan)  # r_1, r_2, ...
+    errors = [1 / np.sqrt(max(count, 1))]  # standard errors, of which the largest is returned
     for t in range(1, min(lags, steps - 1) + 1):
-        pairs = int(np.sum(is_known[:, :-t] & is_known[:, t:]))
+        pairs = int(np.sum(is_known[:, :-t] & is_known[:, t:]))  # n_t
         if pairs and power > 0:
             share = (1 - t / steps) * count / pairs
             correlations[t - 1] = share * np.sum(e[:, :-t] * e[:, t:]) / power

@@ -32,7 +32,16 @@ def mark_checked(value: object, report: Callable[[str, Domain], None]) -> Domain
 
 
 def report_domain(name: str, value: object, whole: Domain, entry: Domain | None = None) -> None:
-    """Tell an array marked by `mark_checked` what numbers it may hold: `whole`, or `entry` if it is in a list."""
+    """Report what numbers an array marked by `mark_checked` may hold; of any other value nothing happens.
+
+    Checks call it with every value that they check: so a free number of a model, which is marked, learns its domain.
+
+    Args:
+        name: name of the value, as in an error.
+        value: what is checked: an array, or a list with arrays in it.
+        whole: the domain if the value itself is marked.
+        entry: the domain of entries of a list that are marked; `whole` by default.
+    """
     if isinstance(value, DomainReportingArray):
         if value.report is not None:
             value.report(name, whole)
@@ -43,7 +52,10 @@ def report_domain(name: str, value: object, whole: Domain, entry: Domain | None 
 
 
 def report_covariance(name: str, value: object) -> None:
-    """Tell an array marked by `mark_checked` that it is a covariance or variance (in rows, on the diagonal)."""
+    """Report that an array marked by `mark_checked` is a covariance, or a variance if it is a single number.
+
+    In a list of rows, marked numbers on the diagonal are variances, and those off it any real numbers.
+    """
     if isinstance(value, DomainReportingArray):
         report_domain(name, value, COVARIANCE if value.ndim else POSITIVE)
     elif isinstance(value, list | tuple):

@@ -57,7 +57,10 @@ def fully_optimised(function: Callable[P, R]) -> Callable[P, R]:
 def _compile_at_call(
     function: Callable[P, R], options: Callable[[], Options], donate: Donated = "none"
 ) -> Callable[P, R]:
-    """Return the function, compiled at its first call: only then is the compiler asked for its options."""
+    """Return the function, compiled at its first call: only then is the compiler asked for its options.
+
+    `options` returns the options of XLA; `donate` says whether results may take the memory of arguments.
+    """
 
     @cache
     def jitted() -> Callable[P, R]:
@@ -67,7 +70,8 @@ def _compile_at_call(
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
-        with pause_collector():  # a first call traces
+        """Return the compiled function's results; the first call for some shapes traces and compiles it."""
+        with pause_collector():  # tracing makes many objects that stay
             return jitted()(*args, **kwargs)
 
     return call

@@ -15,16 +15,21 @@ class FrozenMapping(Mapping[K, V], Generic[K, V]):
         self._items = dict(items)
 
     def __getitem__(self, key: K) -> V:
+        """Return the value of a key."""
         return self._items[key]
 
     def __iter__(self) -> Iterator[K]:
+        """Yield the keys, in the order in which they were given."""
         return iter(self._items)
 
     def __len__(self) -> int:
+        """Return the number of items."""
         return len(self._items)
 
     def __hash__(self) -> int:
+        """Return a hash of the items, whatever their order."""
         return hash(frozenset(self._items.items()))
 
     def __repr__(self) -> str:
+        """Return the items as a dictionary is shown."""
         return repr(self._items)

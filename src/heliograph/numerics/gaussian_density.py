@@ -61,7 +61,10 @@ def log_density(
     agreement = OFF_SUPPORT * jnp.sqrt(variance) + OFF_VALUE * jnp.where(present, size, 0.0)
 
     def condition_on_component(j: Any, state: _ConditionedVector) -> _ConditionedVector:
-        """Add log N of component j given those before it, and condition the components behind it on it."""
+        """Add the log density of component j given those before it, and condition the later components on it.
+
+        With the deviations e and covariance S given the earlier ones, e_i becomes e_i - (s_ij / s_jj) e_j.
+        """
         e, left = state.value, state.covariance
         pivot = left[j, j]
         # Zero but for rounding, which may leave it below zero: by the more, the more rounding was amplified before.
@@ -103,10 +106,11 @@ def differentiate_log_density(
     the information is de' S^-1 de + tr(S^-1 dS S^-1 dS) / 2. Here de and dS are the `slopes`, the derivatives of value
     and covariance in the p numbers; see `log_density` for the other arguments.
     """
+    slopes_of_value, slopes_of_covariance = slopes
     both = present[:, None] & present  # pairs of components of which both are present
     density = log_density(value, covariance, size, present)
     e, s = jnp.where(present, value, 0.0), jnp.where(both, covariance, 0.0)
-    de, ds = jnp.where(present, slopes[0], 0.0), jnp.where(both, slopes[1], 0.0)
+    de, ds = jnp.where(present, slopes_of_value, 0.0), jnp.where(both, slopes_of_covariance, 0.0)
     p, m = de.shape
     # S^-1 e (m,), S^-1 de (m, p) and S^-1 dS (m, p, m) by one factorisation: their right sides stand side by side.
     solved = psd_solve(s, jnp.concatenate([e[:, None], de.T, jnp.moveaxis(ds, 0, 1).reshape(m, p * m)], axis=1))

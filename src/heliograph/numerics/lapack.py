@@ -17,9 +17,9 @@ A = TypeVar("A", jax.Array, np.ndarray)
 def eigh(a: Float[jax.Array, "n n"]) -> tuple[Float[jax.Array, " n"], Float[jax.Array, "n n"]]:
     """Return the eigenvalues and eigenvectors (columns) of a symmetric matrix; a batch is computed one after another.
 
-    JAX would distribute a batch over the processor's threads, by a call that waits for them on one of them. Programs
-    that run side by side on as many threads would then wait for each other for ever. One after another they have no
-    derivative backwards, so that what is differentiated leaves it to JAX.
+    A batch is what `vmap` makes of calls side by side. JAX would distribute it over the processor's threads, by a call
+    on one of them that waits for the others, so that programs side by side could wait for each other for ever. The loop
+    has no derivative backwards: within `write_for_derivatives` the matrices are left to JAX.
     """
     values, vectors = jnp.linalg.eigh(a) if writes_for_derivatives() else _eigh(a)
     return values, vectors
@@ -45,12 +45,12 @@ def pseudo_solve(a: A, b: A, tolerance: float = 1e-12) -> A:
 
 
 def spectral_radius(matrix: Float[np.ndarray, "N N"]) -> float:
-    """Return the largest modulus of an eigenvalue."""
+    """Return the spectral radius of a square matrix, the largest modulus of an eigenvalue; 0 of an empty one."""
     return float(np.max(np.abs(np.linalg.eigvals(matrix)), initial=0.0))
 
 
 def regular_solve(a: Float[jax.Array, "n n"], b: Float[jax.Array, "n k"]) -> Float[jax.Array, "n k"]:
-    """Solve A X = B for a regular A; of a batch one after another, as `eigh`."""
+    """Return the solution X of A X = B for a regular A; a batch of systems is solved one by one, as in `eigh`."""
     return jnp.asarray(_regular_solve(a, b))
 
 

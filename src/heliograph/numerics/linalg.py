@@ -36,17 +36,21 @@ def diagonal(a: Array) -> jax.Array:
 
 
 def symmetrize(a: Float[jax.Array, "... n n"]) -> Float[jax.Array, "... n n"]:
-    """Return (A + A') / 2."""
+    """Return the symmetric part (A + A') / 2 of matrices (..., n, n)."""
     return jnp.asarray((a + jnp.swapaxes(a, -1, -2)) / 2)
 
 
 def outer(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Return a b' as a matrix product, in which an entry known to be zero stays known to be zero."""
+    """Return a b' of two vectors as a matrix product, in which native code knows that 0 times any entry is zero."""
     return lax.dot(lax.expand_dims(a, (1,)), lax.expand_dims(b, (0,)))
 
 
 def scale(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Return a_i b_i as matrix products of one number each, in which an entry known to be zero stays known."""
+    """Return the products a_i b_i of two vectors, in which an entry known to be zero stays known to be zero.
+
+    They are written as matrix products of one number each: native code leaves out a known zero's term there, while it
+    computes 0 x in an elementwise product, since x may be NaN.
+    """
     return lax.dot_general(a, b, (((), ()), ((0,), (0,))))
 
 
@@ -59,7 +63,7 @@ def where(condition: Array, a: Array | float, b: Array | float) -> jax.Array:
     dtype = jnp.result_type(a, b)
 
     def broadcast(x: Array | float, dtype: np.dtype[Any]) -> Array:
-        """Return x as an array of this type and of the common shape."""
+        """Return x as an array of this type, broadcast to the common shape by one operation of JAX, if any."""
         if np.shape(x) == shape and isinstance(x, jax.Array | np.ndarray) and x.dtype == dtype:
             return x
         known = np.asarray(x, dtype) if not isinstance(x, jax.Array) else lax.convert_element_type(x, dtype)
@@ -69,12 +73,12 @@ def where(condition: Array, a: Array | float, b: Array | float) -> jax.Array:
 
 
 def contract(tensor: Array, matrix: Array) -> jax.Array:
-    """Return sum_ab T_ijab W_ab."""
+    """Return the matrix of entries sum_ab T_ijab W_ab, of a tensor T (m, m, n, n) and a matrix W (n, n)."""
     return jnp.einsum("ijab,ab->ij", tensor, matrix)
 
 
 def rounding(tolerance: float, like: jax.Array | np.ndarray, units: int = 10) -> float:
-    """Return a relative tolerance, or so many units of an array's rounding where its precision does not allow that."""
+    """Return a relative tolerance, or if that is larger `units` times eps, the rounding of the array `like`."""
     return max(tolerance, units * float(np.finfo(like.dtype).eps))
 
 
@@ -101,7 +105,10 @@ def factor(a: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def _factor_in_loop(a: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Compute `factor` as a loop over the columns."""
+    """Return what `factor` does, L (n, n) with A = L L' and the reciprocals (n,) of its diagonal, by a loop.
+
+    It is for matrices of many rows, of which a program written out column by column would be long.
+    """
     n, whole = len(a), diagonal(a)
 
     def eliminate(j: jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
@@ -138,7 +145,11 @@ def compute_pivot_reciprocal_root(pivot: jax.Array, whole: jax.Array, growth: ja
 
 
 def negative_tolerance(like: jax.Array, growth: jax.Array) -> jax.Array:
-    """Return the share of its diagonal entry that a negative pivot may have by rounding, in a singular matrix."""
+    """Return how far below zero a pivot may be by rounding, as a share of its diagonal entry, in a singular matrix.
+
+    `like` has the precision; `growth` is the largest ratio so far of a diagonal entry to its pivot, by which rounding
+    errors are multiplied.
+    """
     eps = float(np.finfo(like.dtype).eps)
     return jnp.maximum(rounding(NEGATIVE_TOLERANCE, like, 1000), 10 * eps * growth)
 
@@ -167,7 +178,10 @@ def psd_solve(a: Float[Array, "n n"], b: Float[Array, "n k"]) -> Float[jax.Array
 
 
 def solver(a: Float[Array, "n n"]) -> Callable[[Array], jax.Array]:
-    """Return the function B -> X of A X = B for one positive semidefinite A, which is factored once for many B."""
+    """Return the function B -> X that solves A X = B for one positive semidefinite A, factored once for many B.
+
+    It is for B (n, k) in the range of A, as `psd_solve` says.
+    """
     lower, scales = factor(jnp.asarray(a))
 
     def solve(b: Array) -> jax.Array:

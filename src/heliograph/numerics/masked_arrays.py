@@ -39,10 +39,12 @@ def find_packing(value: Any) -> str:
 
 
 def holds_texts_or_dates(numbers: np.ndarray) -> bool:
-    """Return whether an array holds texts, dates or spans of time: no numbers, though they may read as such."""
-    return numbers.dtype.kind in "USmM" or (
-        numbers.dtype.kind == "O" and any(isinstance(entry, str | bytes) for entry in numbers.flat)
-    )
+    """Return whether an array holds texts, dates or spans of time: no numbers, though they may read as such.
+
+    Of an array of objects only texts among them count.
+    """
+    kind = numbers.dtype.kind  # U and S: texts, m: spans of time, M: dates, O: any objects
+    return kind in "USmM" or (kind == "O" and any(isinstance(entry, str | bytes) for entry in numbers.flat))
 
 
 def _fill_array(numbers: np.ndarray, masked: np.ndarray) -> np.ndarray:

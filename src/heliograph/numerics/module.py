@@ -51,7 +51,7 @@ def are_same(x: Any, y: Any) -> bool:
 
 
 def _same_attributes(x: object, y: object) -> bool:
-    """Compare the attributes that a subclass of dict has in addition to its entries."""
+    """Return whether two mappings have the same attributes, which a subclass of dict may have beside its entries."""
     return are_same(getattr(x, "__dict__", None), getattr(y, "__dict__", None))
 
 
@@ -132,9 +132,13 @@ def _html(self: object) -> str:
 
 
 def _are_equal(self: object, other: object) -> bool:
-    """Return whether both are of the same class and equal in every part; NaN equals NaN."""
-    # Any object that is no container is compared by its state for copying: its attributes, also those in slots.
-    if type(self) is type(other) and not (is_dataclass(self) or isinstance(self, Mapping | tuple)):
+    """Return whether both are of the same class and equal in every part; arrays count as a whole, NaN equals NaN.
+
+    `are_same` goes through containers, dataclasses and arrays itself. Of any other object it would ask ==, which is
+    this function: so their attributes are compared, also those in slots, as `__getstate__` lists them for a copy.
+    """
+    is_container = is_dataclass(self) or isinstance(self, Mapping | tuple)
+    if type(self) is type(other) and not is_container:
         return are_same(self.__getstate__(), other.__getstate__())
     return are_same(self, other)
 
@@ -177,7 +181,7 @@ def format_on_one_line(value: object, depth: int) -> str:
 
 
 def _is_ours(value: object) -> bool:
-    """Return whether an object is written by this module."""
+    """Return whether an object's text is written by `_write_repr`: its class was given to `readable`."""
     return getattr(type(value), "__repr__", None) is _write_repr
 
 
@@ -220,7 +224,7 @@ def _join_first_items(start: str, items: Iterable[E], count: int, depth: int, of
 
 
 def cut(text: str) -> str:
-    """Return a line of at most WIDTH characters."""
+    """Return a text cut to WIDTH characters, with … at the end where it is longer."""
     return text if len(text) <= WIDTH else f"{text[: WIDTH - 1]}…"
 
 

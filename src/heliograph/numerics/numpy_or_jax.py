@@ -72,7 +72,7 @@ def warn_of_single(name: str, value: object) -> None:
 
 
 def describe_rounded(rounded: tuple[float, float]) -> str:
-    """Return in words which number was meant, and which it is."""
+    """Return in words which number was meant, and which it is, from these two: "0.1 is 0.1000000015"."""
     return f"{rounded[0]:g} is {rounded[1]:.10g}"
 
 
@@ -83,7 +83,10 @@ def _warn_once(text: str) -> None:
 
 
 def constants(function: Callable[..., Any], *arguments: object) -> tuple[list[Any], tuple[int, ...]]:
-    """Trace a function in double precision; return the arrays that it holds as constants, and its result's shape."""
+    """Return the arrays that a function of JAX holds as constants, and its result's shape, from a trace of it.
+
+    The trace is in double precision; `arguments` are examples, of which shapes and types count.
+    """
     with jax.enable_x64(True):
         program = jax.make_jaxpr(lambda *values: as_real(function(*values)))(*arguments)
     shape: tuple[int, ...] = program.out_avals[0].shape
@@ -112,12 +115,12 @@ def as_real(value: object) -> jax.Array:
 
 
 def library(*values: object) -> Any:
-    """Return numpy for known numbers, jax.numpy where one is traced."""
+    """Return the module numpy for known numbers, or jax.numpy where one is traced: they have the same functions."""
     return jnp if is_traced(*values) else np
 
 
 def scipy_for(*values: object) -> Any:
-    """Return scipy, or jax.scipy where a number is traced."""
+    """Return the module scipy for known numbers, or jax.scipy where one is traced."""
     return jax.scipy if is_traced(*values) else scipy
 
 
@@ -140,7 +143,7 @@ def called_program(operation: JaxprEqn) -> ClosedJaxpr | None:
 
 
 def plain(value: Any) -> float | jax.Array:
-    """Return a known number as a Python float, a traced one unchanged."""
+    """Return a known number as a float of Python, and one that JAX traces as it is."""
     number: float | jax.Array = value if is_traced(value) else float(value)
     return number
 
@@ -168,7 +171,7 @@ def block_diagonal(blocks: Sequence[Any]) -> Any:
 
 
 def is_zero(value: Any) -> bool:
-    """Return whether a number is known to be zero."""
+    """Return whether all numbers of an array are known to be zero; of traced ones nothing is known."""
     return not is_traced(value) and not np.any(value)
 
 
@@ -188,7 +191,7 @@ EQUAL = 1e-12  # relative: numbers that were computed in another order
 
 
 def equal_to_rounding(a: Any, b: Any) -> bool:
-    """Test whether arrays have one shape and entries equal to rounding (EQUAL); a traced one equals only itself."""
+    """Return whether arrays have one shape and entries equal to rounding (EQUAL); a traced one equals only itself."""
     if is_traced(a, b) or np.shape(a) != np.shape(b):
         return a is b
     x, y = np.asarray(a), np.asarray(b)

@@ -43,17 +43,17 @@ class NameWithUnit(str):
         return named
 
     def __reduce__(self) -> tuple[type["NameWithUnit"], tuple[str, str]]:
-        """Return what a copy in another process is made from."""
+        """Return the class and its arguments, by which pickle makes the name with its unit again."""
         return NameWithUnit, (str(self), self.unit)
 
 
 def unit_of(name: str) -> str:
-    """Return the unit of a name, or an empty text."""
+    """Return the unit that a name carries, such as "m/s", or "" if it carries none."""
     return name.unit if isinstance(name, NameWithUnit) else ""
 
 
 def rename(name: str, new: str) -> str:
-    """Return a new name for what has this one: of the same unit."""
+    """Return the name `new` with the unit of `name`, if that carries one."""
     return NameWithUnit(new, name.unit) if isinstance(name, NameWithUnit) else new
 
 

@@ -54,9 +54,10 @@ Ended = TypeVar("Ended", bound=WithEnds)
 
 
 class FunctionInUnits(Module):
-    """A function f of vectors, in other units: r f(x_1 / a_1, ...). Functions in all units share one program.
+    """A function f of vectors in old units as the function r f(x_1 / a_1, ...) of vectors in new units.
 
-    result_factors: r, new units of the result per old one. argument_factors: a_1, ..., the same of each argument.
+    A number in new units is a factor times that in old ones. result_factors: r, the factors of the result's entries.
+    argument_factors: a_1, ..., those of each argument's entries. Functions in all units share one compiled program.
     """
 
     function: Callable[..., ArrayLike]
@@ -64,7 +65,11 @@ class FunctionInUnits(Module):
     argument_factors: tuple[np.ndarray, ...]
 
     def __call__(self, *vectors: jax.Array) -> jax.Array:
-        """Return the function's value in the new units, of vectors in the new units."""
+        """Return r f(x_1 / a_1, ...): the value in new units of the function f, of vectors x_1, ... in new units.
+
+        A number in new units is its factor times the number in old units: a_1, ... (`argument_factors`) for the entries
+        of each vector, r (`result_factors`) for those of the value. f (`self.function`) takes and returns old units.
+        """
         in_old_units = (x / factors for x, factors in zip(vectors, self.argument_factors, strict=True))
         return jnp.asarray(self.result_factors) * jnp.asarray(self.function(*in_old_units))
 
@@ -144,7 +149,7 @@ def _rescale_gaussian(filter: GaussianFilter | OpenLoop, units: Units) -> Gaussi
 
 
 def _require_gaussian(filter: AbstractFilter) -> GaussianFilter:
-    """Return the filter, which has to be Gaussian."""
+    """Return the filter, with its type checked: a part of a sequential filter or of a predictor is Gaussian."""
     assert isinstance(filter, GaussianFilter)
     return filter
 
@@ -172,7 +177,10 @@ def _rescale_noise(law: AbstractNoise, factors: Float[np.ndarray, " n"]) -> Abst
 
 
 def rescale_plant(plant: AnyPlant, units: Units) -> AnyPlant:
-    """Return the plant in other units: of states S x, with inputs U u."""
+    """Return the plant, or the plant at each step, in other units: with states S x and inputs U u.
+
+    S and U are the diagonal matrices of the factors of states and inputs in `units`.
+    """
     rescaled: AnyPlant = at_each_step(lambda step: _rescale_plant(step, units), plant)
     return rescaled
 
@@ -201,9 +209,10 @@ def _rescale_plant(plant: AbstractPlant, units: Units) -> AbstractPlant:
 
 
 def _rescale_initial_law(plant: AbstractPlant, s: np.ndarray) -> tuple[np.ndarray, AbstractNoise | np.ndarray]:
-    """Return the center and the law (or the covariance) of the initial state S x_0 with S = diag(s).
+    """Return the center, and the law of the deviation from it or its covariance, of the initial state S x_0.
 
-    A law is that of the deviation from the center. The center is the mean minus the deviation's own mean.
+    S is diag(s), s the factors of the states in other units. A plant has a covariance, or a law of the deviation, whose
+    mean may not be zero: so the center is the mean of the state less that of the deviation.
     """
     if plant.deviation is None:
         return s * plant.initial_mean, np.outer(s, s) * plant.initial_covariance
@@ -214,9 +223,13 @@ def _rescale_initial_law(plant: AbstractPlant, s: np.ndarray) -> tuple[np.ndarra
 def _rescale_matrix(
     matrix: MatrixOfInputs | ArrayLike, rows: np.ndarray, columns: np.ndarray, inputs: np.ndarray
 ) -> FunctionInUnits | np.ndarray:
-    """Return the matrix of rows_i A_ij / columns_j, all factors but A; it is a function of the inputs if A is one.
+    """Return a plant's matrix A in other units, with the entries r_i A_ij / c_j; a function of the inputs if A is one.
 
-    `inputs` are the factors by which the inputs are divided before this function is called.
+    Args:
+        matrix: A.
+        rows: factors r of what the matrix returns, such as states.
+        columns: factors c of what it multiplies.
+        inputs: factors of the inputs, by which new ones are divided before the function is called.
     """
     factor = rows[:, None] / columns
     if isinstance(matrix, MatrixOfInputs):
@@ -225,7 +238,10 @@ def _rescale_matrix(
 
 
 def rescale_sensor(sensor: AnySensor, units: Units) -> AnySensor:
-    """Return the sensor in other units: it measures R y of states S x."""
+    """Return the sensor, or the sensor at each step, in other units: it measures R y of states S x.
+
+    R and S are the diagonal matrices of the factors of outputs and states in `units`.
+    """
     rescaled: AnySensor = at_each_step(lambda step: _rescale_sensor(step, units), sensor)
     return rescaled
 
@@ -251,18 +267,24 @@ def _rescale_moments(channel: SecondOrder | OverTime, units: Units) -> SecondOrd
 def rescale_channel(channel: SecondOrder, units: Units) -> SecondOrder:
     """Return the second moments of a channel z = G y + n in other units: of outputs R y and measurements Q z.
 
-    In these units it is z = Q G R^-1 y + Q n, where R and Q are diagonal matrices of the factors in `units`. `factor`
-    holds for each pair of entries of (G, n) the product of the entries' factors, which scales their second moment.
+    In these units it is z = Q G R^-1 y + Q n, where R and Q are diagonal matrices of the factors in `units`. With
+    M = (G, n), the second moment E[M_ia M_jb] of two entries is multiplied by the product of the entries' factors.
     """
-    q, (_, factor) = units.received, _list_channel_factors(units)
+    _factors_of_entries, factors_of_pairs = _list_channel_factors(units)
 
     def scale(moments: QuadraticMap) -> QuadraticMap:
-        """Return second moments of (G, n) in the other units."""
-        return QuadraticMap(factor * moments.center, factor * moments.radius)
+        """Return second moments of M in the other units.
 
-    gain, offset = q[:, None] * channel.mean_gain / units.outputs, q * channel.offset
+        A moment that is uncertain lies within +- `radius` of `center`, so that both are scaled alike.
+        """
+        return QuadraticMap(factors_of_pairs * moments.center, factors_of_pairs * moments.radius)
+
+    q = units.received
+    mean_gain, mean_offset = q[:, None] * channel.mean_gain / units.outputs, q * channel.offset
+    mean = np.concatenate([mean_gain, mean_offset[:, None]], axis=1)
+    # The covariance of M, the square of the error of its mean, E[M_ia M_jb], and the covariance of the nominal law;
+    # the first three are bounds where the channel's law is uncertain.
     spread, shift, power, nominal = map(scale, (channel.spread, channel.shift, channel.power, channel.nominal))
-    mean = np.concatenate([gain, offset[:, None]], axis=1)
     return describe_second_moments(mean, spread, shift, power, nominal, channel.uncertain)
 
 
@@ -324,7 +346,12 @@ def _rescale_centre(centre: UnconditionalMean | None, units: Units) -> Unconditi
 
 
 def _rescale_system(filter: LinearSystemFilter, degree: int, units: Units) -> LinearSystemFilter:
-    """Return the filter of a linear system with state and measurements in other units: monomials by powers of these."""
+    """Return the filter of a linear system with state and measurements in other units.
+
+    The system's state has the monomials of the plant's state up to a degree, and its output those of what is received:
+    each is multiplied by the product of its factors. With their diagonal matrices Y and Z, the transition A becomes
+    Y A Y^-1, the drift Y b, the output matrix Z C Y^-1, and the covariances Y Q Y and Z R Z.
+    """
     y, z = _scale_monomials(units.states, degree), _scale_monomials(units.received, degree)
     s = filter.steps.values
     if s.transition.shape[-1] != len(y):  # monomials and 1, mode after mode, behind links that remember
@@ -343,6 +370,11 @@ def _rescale_system(filter: LinearSystemFilter, degree: int, units: Units) -> Li
 
 
 def _scale_monomials(factors: Float[np.ndarray, " n"], degree: int) -> Float[np.ndarray, " N"]:
-    """Return the factors (N,) of monomials up to `degree` of numbers with these factors, without the constant 1."""
-    table = np.array(list_exponents(len(factors) + 1, degree))[:-1, :-1]
-    return np.asarray(np.prod(factors**table, axis=1))
+    """Return the factors (N,) of monomials up to `degree` of numbers with these factors, without the constant 1.
+
+    The monomial x^a y^b of numbers with the factors s and t has the factor s^a t^b.
+    """
+    # Exponents of all products of `degree` of the numbers (x, 1), a row for each; the last column is that of the 1, and
+    # the last row that of the product of ones.
+    exponents = np.array(list_exponents(len(factors) + 1, degree))[:-1, :-1]
+    return np.asarray(np.prod(factors**exponents, axis=1))

@@ -19,7 +19,8 @@ FALSE_ALARM = 1e-6  # probability that a correct object fails, shared by all num
 def check_random_affine(channel: AbstractRandomAffine, seed: int = 0, samples: int = 20_000, highest: int = 4) -> float:
     """Compare a channel's samples with its joint moments, E[mono_k(z) | y] for k = 1 .. highest, at two points y.
 
-    mono_k(z) are all products of k of the numbers of (z, 1). Wrong moments are found when they differ by more than
+    A channel maps a vector y to z = G y + n with random G and n. mono_k(z) are all products of k of the numbers of
+    (z, 1). Wrong moments are found when they differ by more than
     about 6 standard errors, so more samples make the test stricter. Of a map with modes two draws are taken one after
     the other: their moments are compared under the laws of the modes, and jointly E[H_1 x H_2] and
     E[mono_i(z_1) mono_j(z_2)] for i, j = 1 .. highest / 2, which a wrong transition changes. A map with another kind of
@@ -32,30 +33,46 @@ def check_random_affine(channel: AbstractRandomAffine, seed: int = 0, samples: i
         highest: highest order of the moments (default 4).
 
     Returns:
-        The largest |z|, a difference in units of its standard error.
+        The largest difference between a moment and its mean over the samples, in standard errors of the mean.
 
     Raises:
         AssertionError: a moment that differs from the samples by more than chance, shapes that disagree.
     """
     generator = np.random.default_rng(seed)
-    # Two successive draws of H = [[G, n], [0, 1]] in each of the samples; its upper rows map (y, 1) to z = G y + n.
-    first, second = (h[:, :-1] for h in _draw_twice(channel, seed, samples))
-    points = [channel.example_input(generator), channel.example_input(generator)]
-    # With modes: two successive draws, compared jointly. Another kind of memory has no moments.
-    if channel.remembers:
-        if not memories(channel):
-            return 0.0
-        modes = joint_modes(channel, order=-(-highest // 2))  # half of it for each draw, rounded up
-        now, later = (map_of_y @ np.append(y, 1.0) for map_of_y, y in zip((first, second), points, strict=True))
-        worst = _compare_draw_pairs(modes, first, second)
-        return max(worst, _compare_modes(modes, points, now, later, highest))
-    # Without memory: E[mono_k(z) | y], order by order.
-    worst = 0.0
-    for y in points:
-        z = first @ np.append(y, 1.0)
-        for order in range(1, highest + 1):
-            expected = channel.moments(order).expect(evaluate_monomials(y, order))
-            worst = max(worst, _compare_means(f"order {order}", expected, _evaluate_monomials(z, order)))
+    # Two successive draws of H = [[G, n], [0, 1]] in each sample. All rows of H but the last are M = (G, n), which maps
+    # (y, 1) to z = G y + n: (samples, outputs, inputs + 1).
+    first_h, second_h = _draw_twice(channel, seed, samples)
+    first_m, second_m = first_h[:, :-1], second_h[:, :-1]
+    first_y, second_y = channel.example_input(generator), channel.example_input(generator)
+    if not channel.remembers:
+        differences = [_compare_moments(channel, y, first_m, highest) for y in (first_y, second_y)]
+        return max(differences)
+    has_modes = bool(memories(channel))
+    if not has_modes:  # another kind of memory, of which no moments are declared
+        return 0.0
+    # With modes: two successive draws, each by itself and jointly, where each has half of the order, rounded up.
+    modes = joint_modes(channel, order=-(-highest // 2))
+    first_z, second_z = first_m @ np.append(first_y, 1.0), second_m @ np.append(second_y, 1.0)
+    worst = _compare_draw_pairs(modes, first_m, second_m)
+    return max(worst, _compare_modes(modes, [first_y, second_y], first_z, second_z, highest))
+
+
+def _compare_moments(channel: AbstractRandomAffine, y: np.ndarray, m: np.ndarray, highest: int) -> float:
+    """Compare a channel's E[mono_k(z) | y], k = 1 .. highest, with means over samples of a channel without memory.
+
+    Args:
+        channel: the channel, which declares the moments.
+        y: its input (inputs,).
+        m: draws of M = (G, n), with z = G y + n (samples, outputs, inputs + 1).
+        highest: the highest order k; mono_k(z) are all products of k of the numbers of (z, 1).
+
+    Returns:
+        The largest difference between samples and moments, in standard errors.
+    """
+    z, worst = m @ np.append(y, 1.0), 0.0
+    for order in range(1, highest + 1):
+        expected = channel.moments(order).expect(evaluate_monomials(y, order))
+        worst = max(worst, _compare_means(f"order {order}", expected, _evaluate_monomials(z, order)))
     return worst
 
 
@@ -156,7 +173,10 @@ def _draw_twice(channel: AbstractRandomAffine, seed: int, samples: int) -> tuple
 
 
 def _evaluate_monomials(z: np.ndarray, order: int) -> np.ndarray:
-    """Return the monomials of this order in (z, 1) for each row of z (samples, outputs), as (samples, monomials)."""
+    """Return all products of `order` of the numbers (z, 1), for each sample of z (samples, outputs).
+
+    They are columns (samples, monomials), in the order of `list_exponents`: the exponents of z's entries and of the 1.
+    """
     values = np.column_stack([z, np.ones(len(z))])
     columns = np.arange(values.shape[1])
     powers = list_exponents(len(columns), order)

@@ -80,27 +80,30 @@ def _check_step(filter: AbstractFilter, state: PyTree, z: np.ndarray, u: np.ndar
 
 
 def _step_filter(filter: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree) -> tuple[PyTree, Estimate]:
-    """Return state and estimate after a step."""
+    """Return state and estimate after one step k of the filter, with measurement z and inputs u."""
     return filter.step(state, z, u, k)
 
 
 def _predict_and_correct(
     filter: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree
 ) -> tuple[PyTree, Estimate, Innovation]:
-    """Return state, estimate and innovation after a prediction and a correction."""
+    """Return state, estimate and innovation after a prediction with inputs u and a correction by z, in step k."""
     predicted = filter.predict(state, u, k)
     corrected, innovation = filter.correct(predicted, z, k)
     return corrected, filter.estimate(corrected), innovation
 
 
 def _step_in_vmap(filter: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree) -> PyTree:
-    """Return the means after two equal steps in one vmap, (2, n)."""
+    """Return the means (2, n) after step k of two filters side by side (`vmap`), of equal states and measurements."""
     twice = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), (state, z))
     return jax.vmap(lambda s, z: filter.step(s, z, u, k)[1].mean)(*twice)
 
 
 def _list_ways_to_step(*arguments: PyTree) -> tuple[PyTree, ...]:
-    """Return the step in each of three ways; native code computes once what they have in common."""
+    """Return the results of a step in three ways: as a step, as its prediction and correction, and within `vmap`.
+
+    Native code of all three together computes once what they have in common.
+    """
     return _step_filter(*arguments), _predict_and_correct(*arguments), _step_in_vmap(*arguments)
 
 
@@ -109,7 +112,7 @@ _ways_by_xla = tuple(map(compile_in_float64, (_step_filter, _predict_and_correct
 
 
 def _list_ways_to_step_by_xla(*arguments: PyTree) -> tuple[PyTree, ...]:
-    """Return the step in each of three ways, each compiled by itself."""
+    """Return the results of a step in the same three ways, each compiled by XLA by itself."""
     return tuple(way(*arguments) for way in _ways_by_xla)
 
 

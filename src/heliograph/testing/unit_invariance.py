@@ -210,7 +210,13 @@ def _find_difference(a: Estimate, b: Estimate, s: np.ndarray) -> np.ndarray:
 
 
 def _rescale_node(name: str, node: Node, units: Units) -> Node:
-    """Return the node in other units, after checking that its channel's moments change as they must."""
+    """Return the node in other units, after checking that its channel's moments change as they must.
+
+    `rescale_channel` changes moments by formula; they must be those of the channel that maps R y to Q z.
+
+    Raises:
+        AssertionError: moments that differ, with the node's name.
+    """
     channel = first(node.channel)
     # The maps of a channel without memory, one for each set of losses.
     maps = [] if channel.remembers else [outcome.map for outcome in channel.list_outcomes()]
@@ -224,7 +230,10 @@ def _rescale_node(name: str, node: Node, units: Units) -> Node:
 
 
 def _change_units_of_channel(channel: Channel, units: Units) -> Channel:
-    """Return the channel that maps R y to Q z, where this one maps y to z."""
+    """Return the channel that maps R y to Q z, where this one maps y to z: the maps R^-1, this channel, Q in series.
+
+    R and Q are the diagonal matrices of the factors of outputs and of measurements in `units`.
+    """
     if isinstance(channel, OverTime):
         return over_time([_change_units_of_channel(step, units) for step in unstack(channel)])
     return Series([known(np.diag(1 / units.outputs)), channel, known(np.diag(units.received))])
@@ -258,7 +267,11 @@ def _find_largest_moments(described: SecondOrder) -> list[np.ndarray]:
 
 
 def _rescale_fusion(name: str, fusion: Fusion | AbstractFilter, units: Units) -> Fusion | AbstractFilter:
-    """Return a central filter in other units; a fusion stays as it is, since its rule has no units."""
+    """Return a central filter in other units; a fusion of estimates stays as it is, since its rule has no units.
+
+    Raises:
+        ValueError: a fusion of quantized estimates, whose cells are in units.
+    """
     if isinstance(fusion, AbstractFilter):
         return rescale_filter(fusion, units)
     if fusion.quantizer is not None:
@@ -267,7 +280,15 @@ def _rescale_fusion(name: str, fusion: Fusion | AbstractFilter, units: Units) ->
 
 
 def _has_search_in_estimate(network: Network, node: str, name: str) -> bool:
-    """Return whether this estimate depends on a search that minimises a trace."""
+    """Return whether an estimate of a network depends on a search that minimises the trace of a covariance.
+
+    The result of such a search depends on units, since a trace adds squares of different ones.
+
+    Args:
+        network: the network.
+        node: name of a node, or `Network.FUSED` for a fusion of all.
+        name: name of the node's filter, or of the fusion.
+    """
     if node != Network.FUSED:
         return _has_search(network.nodes[node].filters[name])
     fusion = network.fused[name]

@@ -17,7 +17,7 @@ from straightline.llvm.operations import (
     write_splat,
 )
 from straightline.llvm.prefetch import PrefetchedRows, write_prefetch_requests
-from straightline.llvm.shared_slots import SharedSlots
+from straightline.llvm.shared_slots import SharedSlots, write_address_in_iteration
 from straightline.llvm.vector_types_and_gathers import WIDTH, gather_name
 from straightline.nodes import REAL, Block, Buffer, Guard, Loop, LoopExit, Node, Store, Type
 from straightline.program import find_fused_product
@@ -29,53 +29,57 @@ Scope = dict[Any, str]
 class FunctionWriter:
     """Writes the LLVM text of one of a program's two functions: the block function, or that of shared numbers.
 
-    The block function computes what differs between runs, for a block of runs at once: each SIMD lane of its vectors
-    has one run. The other function computes once what all runs share.
-
-    Args:
-        single: whether vectors have one lane, as in the function of shared numbers.
-        items: the operations and statements that this function computes.
-        products: products that are fused with the sum that uses them.
-        per_run: the buffers that have a number for each run of the block, and so for each lane.
-        slots: memory of the shared numbers that one function computes and the other loads.
+    A run is one evaluation of the program. The block function computes what differs between runs, for a block of runs
+    at once: each SIMD lane of its vectors has one run. The other function computes once what all runs share.
     """
 
     def __init__(
         self, single: bool, items: Collection[Any], products: set[Node], per_run: set[Any], slots: SharedSlots
     ):
-        """Begin the text of a function that computes `items`, without lines as yet.
+        """Begin an empty text of LLVM.
 
-        `single`: vectors have one lane. `products` are fused with their sums. `per_run` are the buffers with a number
-        for each lane. `slots` is the memory of numbers that all runs share.
+        Args:
+            single: whether vectors have one lane, as in the function of shared numbers.
+            items: the operations and statements of the program that this function computes.
+            products: products a b that are written as one operation with the sum that uses them, a b + c.
+            per_run: the arrays in memory that have a number for each run of the block, and so for each lane.
+            slots: memory of the numbers that all runs share: one function stores them there, the other loads them.
         """
         self.single, self.items, self.products, self.per_run, self.slots = single, items, products, per_run, slots
+        # The text, the label and first line of the basic block that is being written, and the LLVM names of the numbers
+        # that can be used there; the innermost loop or guard has the last scope.
         self.lines: list[str] = []
+        self.label, self.first_line = "entry", 0
         self.scopes: list[Scope] = [{}]
-        self.label, self.first_line = "entry", 0  # of LLVM's basic block that is being written
-        self.count = 0  # of names made so far, which are %1, %2, ...
-        self.called: set[str] = set()  # functions that must be declared
-        self.gathered: set[tuple[int, bool]] = set()  # bits of a number, and whether each lane has entries
-        self.read: set[Buffer] = set()  # buffers that all runs share
+        self.count = 0  # names made so far: %t1, %t2, ...
+        # What it needs besides: functions that it calls, loads by an index of each lane (bits of a number, and whether
+        # the memory has a number for each lane), and shared memory that it reads.
+        self.called: set[str] = set()
+        self.gathered: set[tuple[int, bool]] = set()
+        self.read: set[Buffer] = set()
+        # Memory, set before the text is written: LLVM names of the buffers' addresses; shared buffers with a copy for
+        # each iteration of their loops; outputs that are summed over runs, with the length of a row of their sums.
         self.bases: dict[Buffer, str] = {}
-        self.per_iteration: Collection[Buffer] = ()  # shared buffers with a copy for each iteration of their loops
-        self.sums: dict[Buffer, int] = {}  # outputs that are added to sums over runs, and the length of their rows
-        self.lanes_with_run = ""  # name of the mask of lanes that have a run, and do not repeat the last one
-        self.flushes = False  # whether subnormal numbers are zeros
-        self.prefetching_loop: Loop | None = None  # the loop that prefetches memory, and which rows
+        self.per_iteration: Collection[Buffer] = ()
+        self.sums: dict[Buffer, int] = {}
+        self.lanes_with_run = ""  # LLVM name of the mask of lanes that have a run of their own, and do not repeat one
+        self.flushes = False  # whether subnormal numbers are taken for zeros
+        # The loop that asks for memory before it is needed, and the rows of memory that it asks for.
+        self.prefetching_loop: Loop | None = None
         self.prefetched_rows: list[PrefetchedRows] = []
 
     def add(self, text: str) -> str:
-        """Append an operation in LLVM's text; return the new name of its result."""
+        """Append an instruction, given without its result as in "add i64 %a, 1"; return the new name of its result."""
         self.count += 1
         self.lines.append(f"  %t{self.count} = {text}")
         return f"%t{self.count}"
 
     def line(self, text: str) -> None:
-        """Append a line without a result."""
+        """Append an instruction without a result, such as a store or a jump."""
         self.lines.append(f"  {text}")
 
     def start_basic_block(self, label: str) -> None:
-        """Begin a basic block."""
+        """Begin a basic block of LLVM with this label: instructions that are entered only at the first one."""
         self.lines.append(f"{label}:")
         self.label, self.first_line = label, len(self.lines)
 
@@ -97,7 +101,7 @@ class FunctionWriter:
                 self._write_guard(statement)
 
     def _go_on_in_new_basic_block(self) -> None:
-        """End the basic block, and begin one that nothing else jumps to."""
+        """End the basic block by a jump to a new one, which nothing else jumps to: long ones take LLVM too long."""
         self.count += 1
         self.line(f"br label %next{self.count}")
         self.start_basic_block(f"next{self.count}")
@@ -161,7 +165,11 @@ class FunctionWriter:
         return name
 
     def _is_scalar(self, node: Node) -> bool:
-        """Return whether a number is equal in all lanes: every number is if a vector has one lane (`single`)."""
+        """Return whether a number is known to be equal in all lanes, so that one scalar says it.
+
+        So are constants, loop counters, and numbers that another function computes for all runs (not in `self.items`).
+        Where a vector has one lane (`single`) every number is.
+        """
         return node.op in ("constant", "counter") or node not in self.items or self.single
 
     def write_broadcast(self, name: str, type: Type) -> str:
@@ -174,9 +182,9 @@ class FunctionWriter:
 
     def _locate(self, buffer: Buffer, offset: int, strides: Sequence[int], indices: Sequence[Node], entry: str) -> str:
         """Return the address of entry offset + sum strides * indices of a buffer; `entry` is the LLVM type of one."""
-        owner, start = buffer.owner
+        owner, start = buffer.owner  # the outermost buffer that contains this one, and this one's first entry in it
         base = self._write_base(owner)
-        # The address of the row by the indices, written once for all entries of it.
+        # The address by the indices, base + sum strides * indices, is written once for all entries of such a row.
         if indices:
             key = ("row", owner, tuple(strides), tuple(indices))
             row = next((scope[key] for scope in reversed(self.scopes) if key in scope), None)
@@ -190,29 +198,15 @@ class FunctionWriter:
         return self.add(f"getelementptr {entry}, ptr {base}, i64 {offset + start}")
 
     def _write_base(self, owner: Buffer) -> str:
-        """Return the address of a buffer's memory; in `per_iteration`, that of its copy for the current iteration."""
+        """Return the LLVM name of a buffer's address; in `per_iteration`, of its copy for the current iteration."""
         if owner not in self.per_iteration:
             return self.bases[owner]
         key = ("base", owner)
         base = next((scope[key] for scope in reversed(self.scopes) if key in scope), None)
         if base is None:
             size = owner.size * BITS[owner.type] // 8  # in bytes
-            base = self.scopes[-1][key] = self.write_address_in_iteration(self.bases[owner], owner.block, size)
+            base = self.scopes[-1][key] = write_address_in_iteration(self, self.bases[owner], owner.block, size)
         return base
-
-    def write_address_in_iteration(self, start: str, block: Block, size: int) -> str:
-        """Write the address, in memory from `start` on, of the `size` bytes for the current iteration; return its name.
-
-        With the loops around `block`, innermost first, of counters c_1, c_2, ... and lengths n_1, n_2, ..., it is
-        start + size (c_1 + n_1 (c_2 + n_2 (c_3 + ...))).
-        """
-        offset, stride = "", size
-        for loop in block.list_loops():
-            assert loop.counter is not None
-            step = self.add(f"mul i64 {self.write_scalar(loop.counter)}, {stride}")
-            offset = self.add(f"add i64 {offset}, {step}") if offset else step
-            stride *= loop.length or 1
-        return self.add(f"getelementptr i8, ptr {start}, i64 {offset}") if offset else start
 
     def _write_load(self, node: Node) -> str:
         """Write the load of buffer[offset + sum strides * indices]; return the name of the vector.
@@ -308,8 +302,7 @@ class FunctionWriter:
             following = finals = self._write_counted_loop(loop, name, counter, carried)
         else:
             following, finals = self._write_conditional_loop(loop, name, carried)
-        # The phi nodes come first, but their arguments are known only now.
-        phis = []
+        phis = []  # which come first, but their arguments are known only now
         if loop.length:
             phis.append(f"  {counter} = phi i64 [0, %{label_before}], [{counter}.next, %{self.label}]")
         for k, start, after in zip(carried, starts, following, strict=True):
@@ -324,18 +317,23 @@ class FunctionWriter:
     def _name_parameters(self, loop: Loop, name: str, counter: str, carried: list[int]) -> None:
         """Note the LLVM names that a loop's counter and carried numbers have within an iteration.
 
-        The counter is the scalar `counter`, and also a vector if this function computes with it. Carried number k, for
-        the k in `carried`, is the phi node %NAME.pk, NAME the loop's `name`.
+        Operations in the body look names up in the innermost scope, `self.scopes[-1]`. Carried number k, for the k in
+        `carried`, is named %NAME.pk, NAME the loop's `name`. The counter is the scalar `counter`, which addresses use;
+        if the body also computes with it, as `self.items` tells, it is copied into a vector with the same in all lanes.
         """
         if loop.counter is not None:
             self.scopes[-1]["scalar", loop.counter] = counter
         for k in carried:
             self._note_name(loop.parameters[k], f"%{name}.p{k}")
         if loop.counter is not None and loop.counter in self.items:
-            self._note_name(loop.counter, self.write_operand(loop.counter))
+            vector = self.write_operand(loop.counter)
+            self._note_name(loop.counter, vector)
 
     def _write_counted_loop(self, loop: Loop, name: str, counter: str, carried: list[int]) -> list[str]:
-        """Write a counted loop's body and the jump back; return the names of the next iteration's carried numbers."""
+        """Write a counted loop's body and the jump back; return the names of the next iteration's carried numbers.
+
+        `name` begins the loop's labels, `counter` names its counter, and `carried` has the numbers of what it carries.
+        """
         self.write_block(loop.body)
         following = [self.write_operand(loop.following[k]) for k in carried]
         self.line(f"br label %{name}.latch")
@@ -349,7 +347,8 @@ class FunctionWriter:
     def _write_conditional_loop(self, loop: Loop, name: str, carried: list[int]) -> tuple[list[str], list[str]]:
         """Write the body of a loop that ends when no lane's condition holds.
 
-        Return the names of the carried numbers in the next iteration, and those of the same numbers after the loop.
+        `name` begins the loop's labels. Return the names of the carried numbers (of which `carried` has the indices) in
+        the next iteration, and those of the same numbers after the loop.
         """
         # The body up to the loop's check, and what follows it in an iteration.
         check = next(i for i, s in enumerate(loop.body.items) if isinstance(s, LoopExit) and s.loop is loop)
@@ -369,14 +368,16 @@ class FunctionWriter:
         return following, [f"%{name}.p{k}" for k in carried]
 
     def _write_any_lane(self, condition: Node) -> str:
-        """Write whether a condition holds in some lane; return its name."""
-        return self.add(f"icmp ne %lanes {self.add(f'bitcast %i1 {self.write_operand(condition)} to %lanes')}, 0")
+        """Write whether a condition holds in some lane; return the name of this bit."""
+        # `%lanes` is the integer type with a bit for each lane.
+        lane_bits = self.add(f"bitcast %i1 {self.write_operand(condition)} to %lanes")
+        return self.add(f"icmp ne %lanes {lane_bits}, 0")
 
     def _write_guard(self, guard: Guard) -> None:
-        """Write a guarded block: it is skipped if its condition holds in no SIMD lane; its results are then 0."""
+        """Write a guarded block: skipped, with results of 0, if its condition holds in no SIMD lane."""
         self.count += 1
         name = f"guard{self.count}"
-        # Jump past the body if no lane needs it. `self.label` is the basic block that is being written.
+        # Jump past the body if no lane needs it.
         any_lane = self._write_any_lane(guard.condition)
         label_before = self.label
         self.line(f"br i1 {any_lane}, label %{name}, label %{name}.end")

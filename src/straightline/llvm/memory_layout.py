@@ -40,7 +40,7 @@ class ProgramParts(NamedTuple):
 
     @property
     def passed_buffers(self) -> list[Buffer]:
-        """Return the buffers whose addresses a caller passes."""
+        """Return the arrays in memory whose addresses a caller passes, in order: inputs, tables, outputs."""
         return [*self.program.inputs, *self.tables, *self.outputs]
 
     @property
@@ -102,7 +102,7 @@ def split_shared_from_differing(
 
 
 def choose_vector_width(items: Iterable[Any]) -> int:
-    """Return how many runs a vector has, one a lane: WIDEST, or 2 WIDEST if most operations are on 32-bit numbers.
+    """Return how many runs a vector has, one in each SIMD lane: WIDEST, or 2 WIDEST if most operations have 32 bits.
 
     An elementary function, and a hash (threefry), takes as long as LONG other operations and counts as LONG.
 
@@ -161,20 +161,28 @@ def lay_out_memory(parts: ProgramParts, block_items: Collection[Any]) -> MemoryL
 
 
 def _check_sums(items: Iterable[Any], outputs: Collection[Buffer]) -> None:
-    """Raise Unsupported unless all `outputs`, which are summed over runs, are real and only stored to.
+    """Raise Unsupported unless the sums over runs of all `outputs` can be made in the place of the outputs themselves.
 
-    An output that the program reads again, or that is part of another array, needs each run's own number. A sum does
-    not have it.
+    The memory of such an output holds only the sum, and no run's own number. So it must be of real numbers, must not be
+    a part of another array, and none of the program's `items` (its operations and statements) may read it again.
     """
-    read = _find_read_buffers(items) if outputs else set()
-    if any(b.inside is not None or b in read or b.type not in REAL for b in outputs):
-        raise Unsupported("a sum over runs of numbers that are used again")
+    if not outputs:
+        return
+    read_again = _find_read_buffers(items)
+    for output in outputs:
+        is_part = output.inside is not None
+        if is_part or output in read_again or output.type not in REAL:
+            raise Unsupported("a sum over runs of numbers that are used again")
 
 
 def _find_read_buffers(items: Iterable[Any]) -> set[Buffer]:
-    """Return the buffers that these items, or what they use directly, load numbers of."""
+    """Return the buffers (arrays in memory) that these items, or what they use directly, load numbers of.
+
+    A part of a larger buffer counts as the larger one.
+    """
     nodes = (node for x in items for node in (x, *list_used_nodes(x)) if isinstance(node, Node))
-    return {node.value[0].owner[0] for node in nodes if node.op == "load"}
+    loaded_buffers = [node.value[0] for node in nodes if node.op == "load"]  # value: (buffer, offset, strides)
+    return {whole for whole, _offset in (buffer.owner for buffer in loaded_buffers)}
 
 
 def _place_buffers(
@@ -182,7 +190,8 @@ def _place_buffers(
 ) -> tuple[int, dict[Buffer, int]]:
     """Place buffers of `width` runs one after another; return their size together and the offset of each, in bytes.
 
-    A buffer in `per_iteration` has a copy for each iteration of the loops around it.
+    Each begins at a multiple of LINE bytes, a cache line. A buffer in `per_iteration` has a copy for each iteration of
+    the loops around it.
     """
     start, offsets = 0, dict[Buffer, int]()
     for buffer in buffers:

@@ -64,7 +64,7 @@ class FunctionSource(NamedTuple):
     work: int
 
     def text(self, width: int) -> str:
-        """Return the text for vectors of so many runs."""
+        """Return the LLVM text for vectors of `width` runs, with the vector types and the functions that it calls."""
         body = zlib.decompress(self.compressed).decode()
         return "\n".join([write_vector_types(width), *(helper(width) for helper in self.helpers), body])
 
@@ -172,9 +172,9 @@ def _count_operations(items: Iterable[Any]) -> Counter[str]:
 
 
 def _is_single_precision(items: Iterable[Any]) -> bool:
-    """Return whether real numbers are all of single precision."""
-    types_ = {x.type for x in items if isinstance(x, Node)}
-    return "f32" in types_ and "f64" not in types_
+    """Return whether a program computes with real numbers, and with none of double precision."""
+    number_types = {x.type for x in items if isinstance(x, Node)}
+    return "f32" in number_types and "f64" not in number_types
 
 
 def _finish_source(text: str, writer: FunctionWriter, others: Sequence[Callable[[int], str]]) -> FunctionSource:

@@ -1,8 +1,8 @@
 """Scalar operations as text of LLVM IR, on vectors <W x T> of as many runs.
 
-A text names the type <W x T> by `%T` and leaves W open: `lanes.types` defines the names, and with them W. The compiler
-decides nothing: a product and a sum are one fused operation only where the text says so, so that the bits of a result
-depend neither on the width nor on the level of optimisation.
+A text names the type <W x T> by `%T` and leaves W open: `vector_types_and_gathers.py` defines the names, and with them
+W. The compiler decides nothing: a product and a sum are one fused operation only where the text says so, so that the
+bits of a result depend neither on the width nor on the level of optimisation.
 """
 
 import struct
@@ -30,12 +30,12 @@ Emit = Callable[[str], str]  # the text of an operation -> the name of its resul
 
 
 def vector_type(type: Type) -> str:
-    """Return the name of the type <W x T>."""
+    """Return LLVM's name of a vector with a number of this type in each of its W lanes, such as %double."""
     return f"%{LLVM[type]}"
 
 
 def write_literal(value: float | int | bool, type: Type) -> str:
-    """Return the LLVM text of a constant; LLVM writes a real one, even a float, by its bits as a double."""
+    """Return the LLVM text of a constant number; LLVM writes a real one, even a float, by its bits as a double."""
     if type in REAL:
         return "0x" + struct.pack(">d", float(value)).hex().upper()
     if type == "bool":
@@ -44,7 +44,7 @@ def write_literal(value: float | int | bool, type: Type) -> str:
 
 
 def write_splat(value: float | int | bool, type: Type) -> str:
-    """Return a constant in all lanes."""
+    """Return the LLVM text of a vector that has a constant in all lanes, such as splat (i64 3)."""
     return f"splat ({LLVM[type]} {write_literal(value, type)})"
 
 
@@ -166,6 +166,7 @@ def _write_division(node: Node, names: list[str], text: str, emit: Emit) -> str:
     """Write a / b or a % b of integers; return the name of its result.
 
     As in JAX, a / 0 has all bits set and a % 0 is a; the least number by -1 is itself, with the rest 0.
+    `names` are those of a and b in the text, `text` their vector type; `emit` appends an instruction.
     """
     op, type, (a, b) = node.op, node.args[0].type, names
     instruction = f"{'s' if type[0] == 'i' else 'u'}{op}"
@@ -206,7 +207,8 @@ def _write_shift(node: Node, names: list[str], text: str, emit: Emit) -> str:
 def _write_conversion(source: Type, target: Type, name: str, emit: Emit) -> str:
     """Write a conversion between types; return the name of its result.
 
-    A real number as an integer is truncated, the type's limit where it is beyond, and 0 of NaN (LLVM's `.sat`).
+    `name` is the number's in the text; `emit` appends an instruction. A real number as an integer is truncated, the
+    type's limit where it is beyond, and 0 of NaN (LLVM's `.sat`).
     """
     operand_type, result_type = vector_type(source), vector_type(target)
     if source == target or LLVM[source] == LLVM[target]:

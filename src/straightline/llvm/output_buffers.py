@@ -13,8 +13,9 @@ from straightline.strided_arrays import StridedArray, contiguous_strides
 def choose_output_buffers(program: Program, last: Collection[int] = ()) -> list[Buffer]:
     """Return a buffer for each result, no buffer twice.
 
-    A result that the program fills in memory stays where it is. A result of nodes is stored number by number. So are
-    the results whose numbers are in `last`: they may overwrite arguments, and must be stored after all others.
+    A result that the program fills in memory stays where it is. A result of nodes (single numbers that the program
+    computes) is stored number by number. So are the results whose numbers are in `last`: they may overwrite arguments,
+    and must be stored after all others.
     """
     lowering = Lowering()
     lowering.graph = program.graph
@@ -29,7 +30,11 @@ def choose_output_buffers(program: Program, last: Collection[int] = ()) -> list[
 
 
 def _find_whole_buffer_or_copy(lowering: Lowering, value: StridedArray, taken: list[Buffer]) -> StridedArray:
-    """Return an array as it is if it is all of a scratch buffer that no other result has taken; else a copy of it."""
+    """Return an array as it is if it is all of a scratch buffer that no other result has taken; else a copy of it.
+
+    A scratch buffer is memory that the program fills. The strides of the whole of it, with the last axis innermost, are
+    those of `contiguous_strides`; `moves` would be offsets that data decide.
+    """
     buffer = value.buffer
     is_contiguous = not value.moves and value.offset == 0 and value.strides == contiguous_strides(value.shape)
     is_free = buffer.kind == "scratch" and buffer.inside is None and buffer not in taken
@@ -40,10 +45,15 @@ def _find_whole_buffer_or_copy(lowering: Lowering, value: StridedArray, taken: l
 
 
 def _store_in_memory(lowering: Lowering, value: Value) -> StridedArray:
-    """Return a copy of an array, of nodes or in memory, that is stored entry by entry in a new buffer."""
+    """Return a copy of an array that is stored entry by entry in a new buffer (memory that the program fills).
+
+    `value` is a NumPy array of nodes, each a number that the program computes, or an array in memory, whose entries are
+    loaded first. The stores are added to `graph.current`, the block of the program that is open: here the outermost.
+    """
+    graph = lowering.graph
     nodes: list[Node] = lowering.nodes(value).ravel().tolist()
-    type: Type = value.type if isinstance(value, StridedArray) else nodes[0].type
-    buffer = Buffer("scratch", type, value.shape, lowering.graph.current)
+    number_type: Type = value.type if isinstance(value, StridedArray) else nodes[0].type
+    buffer = Buffer("scratch", number_type, value.shape, graph.current)
     for index, node in enumerate(nodes):
-        lowering.graph.store(buffer, node, offset=index, strides=(), indices=())
+        graph.store(buffer, node, offset=index, strides=(), indices=())  # buffer[index] = node
     return StridedArray.of_whole_buffer(buffer)

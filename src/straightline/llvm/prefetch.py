@@ -36,14 +36,16 @@ def find_longest_loop(items: Iterable[Any]) -> Loop | None:
 
 
 def count_cache_lines_per_iteration(bytes: int, width: int, loop: Loop) -> int:
-    """Return how many cache lines a loop prefetches in an iteration: all together fetch the rows of `width` runs.
+    """Return how many cache lines a loop asks for in each iteration, ahead of their use; 0 if that does not pay.
 
-    `bytes` is the size of a row, one run's numbers. A prefetched line takes as long as PATIENCE operations. Return 0
-    if the lines would take longer than the iteration's operations, which could then not hide them.
+    In all its iterations together the loop fetches the rows of `width` runs; a row is one run's numbers, of `bytes`
+    bytes. A line arrives in the time of PATIENCE arithmetic operations. If the lines of an iteration take longer than
+    its operations, these cannot hide the wait, and nothing is fetched.
     """
-    lines = divide_rounded_up(bytes * width, (loop.length or 1) * LINE)
+    iterations = loop.length or 1  # no length: the number of iterations is not known
+    lines_per_iteration = divide_rounded_up(bytes * width, iterations * LINE)  # LINE: bytes of a cache line
     operations = sum(isinstance(x, Node) and x.op != "load" for x in loop.body.items)
-    return lines if lines * PATIENCE <= operations else 0
+    return lines_per_iteration if lines_per_iteration * PATIENCE <= operations else 0
 
 
 def write_prefetch_requests(

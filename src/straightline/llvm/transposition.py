@@ -15,7 +15,7 @@ FEW = 8  # entries of a run from which on squares of the largest registers are f
 
 
 class TextLines:
-    """Text with fresh names."""
+    """Lines of LLVM's text of a function, in which each result has a new name."""
 
     def __init__(self) -> None:
         """Begin a text without lines; `count` is the number of names made so far."""
@@ -23,7 +23,7 @@ class TextLines:
         self.count = 0
 
     def add(self, text: str) -> str:
-        """Append an operation in LLVM's text; return the new name of its result."""
+        """Append an instruction, given without its result as in "add i64 %a, 1"; return the new name of its result."""
         self.count += 1
         self.lines.append(f"  %x{self.count} = {text}")
         return f"%x{self.count}"
@@ -119,8 +119,12 @@ def _write_register_mover(text: TextLines, move: MoverOptions, group_size: int, 
     Runs are computed side by side in SIMD lanes; memory has them as [run][entry], the lanes need [entry][lane]. A group
     of g = `group_size` runs has n g numbers, one after another in memory, which fill n registers of g lanes. In the
     lanes' memory they also are n registers, one for each entry. So each register of the result picks its numbers from
-    loaded ones. This works if each lane has a run of its own. If some lanes repeat the last run, the program jumps to
-    the label "singles", behind which entries are moved one by one. `text`: the lines of LLVM written so far.
+    loaded ones. Of n = 2 entries a, b and g = 4 runs, the registers (a0 b0 a1 b1), (a2 b2 a3 b3) become (a0 a1 a2 a3),
+    (b0 b1 b2 b3).
+
+    This works if each lane has a run of its own. If some lanes repeat the last run, the program jumps to the label
+    "singles", behind which entries are moved one by one. `text`: the lines of LLVM written so far; `width`: lanes of a
+    vector.
     """
     n, g = move.few_entries, group_size
     # Branch: does the last lane, run first + width - 1, still have a run?
@@ -149,7 +153,7 @@ def _write_register_mover(text: TextLines, move: MoverOptions, group_size: int, 
 
 
 def _write_address(bits: int, start: str, number: int) -> str:
-    """Return the operation that makes the address of a number behind a start."""
+    """Return LLVM's operation for the address of number `number`, each of `bits` bits, counted from address `start`."""
     return f"getelementptr i{bits}, ptr {start}, i64 {number}"
 
 

@@ -8,7 +8,10 @@ from straightline.llvm.transposition import TextLines
 
 @cache
 def write_vector_types(width: int) -> str:
-    """Return the text that names each type <W x T> `%T`, and an integer of W bits `%lanes`."""
+    """Return the LLVM text that defines the vector types of `width` lanes, such as %double, and the integer %lanes.
+
+    %lanes has a bit for each lane. The rest of a program's text uses these names, so that one text serves any width.
+    """
     vectors = [f"%{scalar} = type <{width} x {scalar}>\n" for scalar in ("double", "float", "i64", "i32", "i8", "i1")]
     return "".join([*vectors, f"%lanes = type i{width}\n"])
 
@@ -18,7 +21,7 @@ WIDTH = "ptrtoint (ptr getelementptr (%i8, ptr null, i64 1) to i64)"
 
 
 def write_lane_numbers(width: int) -> str:
-    """Write `%i64 @hg_lanes()`: 0, 1, ... W - 1."""
+    """Return the LLVM text of the function `%i64 @hg_lanes()`, which returns 0, 1, ..., width - 1, one in each lane."""
     numbers = ", ".join(f"i64 {lane}" for lane in range(width))
     return f"define internal %i64 @hg_lanes() noinline nounwind {{\n  ret %i64 <{numbers}>\n}}\n"
 

@@ -9,10 +9,9 @@ import jax
 import numpy as np
 from jax.extend.core import JaxprEqn
 
-from straightline.lowering import IN_MEMORY, RULES, Lowering, Value, arrange_nodes
+from straightline.lowering import IN_MEMORY, RULES, Lowering, Value, arrange_nodes, estimate_size, make_placeholder
 from straightline.nodes import Block, Guard, Node, RandomKey
 from straightline.rules.elementwise import select
-from straightline.rules.loops import estimate_size
 from straightline.size_limits import DEAR
 
 CALLS = (
@@ -22,7 +21,10 @@ CALLS = (
 
 
 def _inline_call(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """Return the results of a call (jit, custom_jvp, ...): the program of its function is written in its place."""
+    """Return the results of a call of JAX (jit, custom_jvp, ...): its function's program is written in its place.
+
+    So the native program has no calls: the operations of the function are added to it one by one (`lowering`).
+    """
     params = equation.params
     # Each kind of call has its own name for the program.
     inner = next(params[name] for name in ("jaxpr", "call_jaxpr", "fun_jaxpr") if name in params)
@@ -30,25 +32,28 @@ def _inline_call(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
 
 
 def _inline_custom_vmap_call(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """Inline a function that has a rule of its own for `vmap`."""
+    """Return the results of a function that has a rule of its own for `vmap`: its program is written in its place."""
     return lowering.inline_program(equation.params["call"], inputs)
 
 
 def _expand_call(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """Return the results of an operation that is defined by other operations, such as frexp in JAX from 0.12 on.
+    """Return the results of an operation that JAX defines by other operations, such as frexp in JAX from 0.12 on.
 
-    Its definition is traced for arguments of these shapes and types, and written in its place.
+    JAX traces the definition for arguments of these shapes and types, and the traced program is written in the place of
+    the operation, as scalar operations of native code (`lowering`).
     """
+    # JAX keeps such an operation as an object: `expand` computes its definition, of arguments in the structure
+    # `in_tree`.
     primitive = equation.params["_prim"]
 
     def expand(*leaves: jax.Array) -> list[jax.Array]:
-        """Return the leaves of the operation's results, computed by its definition."""
-        return jax.tree.leaves(primitive.expand(*jax.tree.unflatten(primitive.in_tree, leaves)))
+        """Return the leaves of the operation's results from the leaves of its arguments, by its definition."""
+        arguments = jax.tree.unflatten(primitive.in_tree, leaves)
+        return jax.tree.leaves(primitive.expand(*arguments))
 
-    avals: list[Any] = [v.aval for v in equation.invars]
-    struct: Any = jax.ShapeDtypeStruct
-    program = jax.make_jaxpr(expand)(*(struct(a.shape, a.dtype) for a in avals))
-    return lowering.inline_program(program, inputs)
+    avals: list[Any] = [v.aval for v in equation.invars]  # shapes and types of the arguments
+    definition = jax.make_jaxpr(expand)(*(make_placeholder(a.shape, a.dtype) for a in avals))
+    return lowering.inline_program(definition, inputs)
 
 
 def _select_platform(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
@@ -120,7 +125,11 @@ def _find_taken_branches(lowering: Lowering, which: Node, count: int) -> list[No
 
 
 def _lower_branch(lowering: Lowering, condition: Node, branch: Any, inputs: list[Value]) -> list[np.ndarray]:
-    """Compute a branch in the open block if it has few nodes, else in a guarded one."""
+    """Compute a branch, and return its results: in the open block if it has few nodes, else in a guarded one.
+
+    A node is a scalar operation of the program. A guarded block is skipped where `condition`, whether the branch is
+    taken, holds in no run; DEAR nodes are worth a jump past them.
+    """
     graph, outer = lowering.graph, lowering.graph.current
     graph.current = block = Block(outer, pinned=True)
     try:
@@ -139,7 +148,10 @@ def _lower_branch(lowering: Lowering, condition: Node, branch: Any, inputs: list
 
 
 def _read_guarded_result(lowering: Lowering, guard: Guard, value: Any) -> Any:
-    """Return a number of a guarded block as seen from outside of it: zero where the block is skipped."""
+    """Return the node that stands for a number of a guarded block outside of it: zero where the block is skipped.
+
+    A number that the block does not compute is returned as it is. A random key is a pair of such numbers.
+    """
     if isinstance(value, RandomKey):
         return RandomKey(
             _read_guarded_result(lowering, guard, value.first), _read_guarded_result(lowering, guard, value.second)
@@ -157,7 +169,7 @@ def _read_guarded_result(lowering: Lowering, guard: Guard, value: Any) -> Any:
 
 
 def _count_block_nodes(block: Block) -> int:
-    """Count the nodes of a block; a statement in it counts as many."""
+    """Count the nodes (scalar operations) of a block; a loop, guard or store in it counts as more than DEAR."""
     return sum(1 if isinstance(statement, Node) else DEAR + 1 for statement in block.items)
 
 
@@ -173,7 +185,10 @@ def _move_statements_out(block: Block, outer: Block) -> None:
 
 
 def _select_arrays(lowering: Lowering, condition: Node, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return array a where the condition, one for all entries, holds, else b."""
+    """Return the nodes that select array a where the condition, one flag for all entries, holds, else array b.
+
+    Data decide the condition, so that each entry becomes a selection, an operation of the program.
+    """
     pairs = zip(a.ravel().tolist(), b.ravel().tolist(), strict=True)
     return arrange_nodes([select(lowering.graph, condition, x, y) for x, y in pairs], a.shape)
 

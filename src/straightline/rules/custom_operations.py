@@ -32,13 +32,16 @@ class _OperationProgram(NamedTuple):
     x64: bool  # whether JAX's numbers were double where it was traced
 
     def __hash__(self) -> int:
+        """Return a hash by the traced program: the same object is the same operation."""
         return id(self.plain)
 
     def __eq__(self, other: object) -> bool:
+        """Return whether the other is of the same traced program; entries of it are not compared."""
         return isinstance(other, _OperationProgram) and self.plain is other.plain
 
     def __repr__(self) -> str:
-        return self.name  # by which the texts of two programs differ
+        """Return the plain function's name, by which the texts of two programs of JAX differ."""
+        return self.name
 
 
 def operation(native: Callable[P, R]) -> Callable[[Callable[P, R]], Callable[P, R]]:
@@ -56,7 +59,7 @@ def operation(native: Callable[P, R]) -> Callable[[Callable[P, R]], Callable[P, 
     """
 
     def decorate(plain: Callable[P, R]) -> Callable[P, R]:
-        """Return the function as one operation of a program, whose native rule is `native`."""
+        """Return the function as one operation (primitive) of JAX, which native code computes by `native`."""
 
         @cache
         def trace_plain_function(tree: Any, kinds: tuple[Any, ...], x64: bool) -> tuple[_OperationProgram, Any]:
@@ -100,8 +103,10 @@ def _apply_plain(
 ) -> list[Any]:
     """Return the results of an operation's plain function, mapped by one `vmap` for each of `levels`.
 
-    A level holds the mapped axis of each argument, None for an argument that is not mapped. The innermost level comes
-    first. `sizes` is a parameter of the primitive that is not needed here.
+    An operation has two forms: a plain function of JAX, which XLA compiles, and another one for native code. JAX knows
+    it as a primitive, whose parameters are `program` (both forms), `levels` and `sizes`. This is what JAX computes, and
+    differentiates, for the primitive. A level holds the mapped axis of each argument, None for an argument that is not
+    mapped; the innermost level comes first. `sizes`, the lengths of the mapped axes, are not needed here.
     """
     function = jaxpr_as_fun(program.plain)
     for axes in levels:
@@ -150,7 +155,7 @@ def _differentiate(primals: Sequence[Any], tangents: Sequence[Any], **params: An
     has_tangent = [not isinstance(tangent, ad.Zero) for tangent in tangents]
 
     def call(*varying: Any) -> list[Any]:
-        """Call the plain function with these in place of the arguments that have tangents."""
+        """Return the plain function's results with `varying` in place of the arguments that have tangents."""
         rest = iter(varying)
         return _apply_plain(*(next(rest) if has else x for has, x in zip(has_tangent, primals, strict=True)), **params)
 
@@ -198,7 +203,7 @@ def _apply_one_by_one(function: Callable[..., list[Any]], axes: Axes, *leaves: A
     """
 
     def call(entries: list[Any]) -> list[Any]:
-        """Call the function for one entry of each leaf that has a batch."""
+        """Return the function's results for one entry of each leaf with a batch, and the other leaves as they are."""
         rest = iter(entries)
         return function(*(x if axis is None else next(rest) for x, axis in zip(leaves, axes, strict=True)))
 

@@ -80,7 +80,11 @@ def _choose_power_of_two_unit(a: jax.Array) -> jax.Array:
 def _make_tournament_turn(
     n: int,
 ) -> tuple[int, Callable[[tuple[Numbers, Numbers], None], tuple[tuple[Numbers, Numbers], None]]]:
-    """Return the count of turns of a sweep, and one turn: A <- J' A J, V <- V J for pairs (p, q), then rows move on."""
+    """Return how many turns a sweep of Jacobi's method has, and the function of one turn.
+
+    A turn rotates disjoint pairs (p, q) of rows at fixed places, A <- J' A J and V <- V J with a rotation J for each,
+    and then moves the rows on to other places. After all turns each row has met each other row once, and is back.
+    """
     # As in a tournament of n players: place k plays place turns - k, all players but the last move on by one place
     # between turns, and the last one plays whoever is at place 0. With n odd there is no last one, and place 0 pauses.
     turns = n - 1 + n % 2
@@ -103,7 +107,10 @@ def _make_tournament_turn(
 
 
 def _rotate_in_place(a: Numbers, vectors: Numbers, p: int, q: int, n: int) -> None:
-    """Rotate rows and columns p and q of A, in place, so that a_pq = 0, and columns p and q of the eigenvectors."""
+    """Rotate rows and columns p and q of A, in place, so that a_pq = 0, and columns p and q of the eigenvectors V.
+
+    With the rotation J, A <- J' A J and V <- V J. `a` has the entries (i, j) with i <= j of the symmetric A (n, n).
+    """
     # The smaller root t = tan(angle) of t^2 + 2 h t - 1 = 0, h = (a_qq - a_pp) / (2 a_pq); c and s: cosine and sine.
     off = a[p, q]
     is_zero = off == 0
@@ -145,7 +152,7 @@ def _sort_by_transposition(
 
 
 def _exchange_if_descending(values: list[jax.Array], columns: list[list[jax.Array]], i: int) -> None:
-    """Exchange values i and i + 1, and columns i and i + 1, in these lists if value i is the greater one."""
+    """Exchange values i and i + 1, and their columns, in these lists if value i is the greater one: by selections."""
     is_descending = values[i] > values[i + 1]
     values[i], values[i + 1] = jnp.minimum(values[i], values[i + 1]), jnp.maximum(values[i], values[i + 1])
     pairs = list(zip(columns[i], columns[i + 1], strict=True))
@@ -180,7 +187,10 @@ def _decompose_each(lowering: Lowering, program: ClosedJaxpr, equation: JaxprEqn
 
 @cache
 def _trace_eigh(n: int, dtype: Any) -> ClosedJaxpr:
-    """Return `eigh` of a matrix (n, n), traced."""
+    """Return the program of `eigh` for a matrix (n, n) of this type, as JAX traces it.
+
+    Each use of JAX's operation writes it out as scalar operations; it is traced once for each size and type.
+    """
     with jax.enable_x64(True):
         return jax.make_jaxpr(eigh)(make_placeholder((n, n), dtype))
 
@@ -215,7 +225,7 @@ def lu(a: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
 
 
 def _exchange_if(condition: jax.Array, items: list[jax.Array], i: int, j: int) -> None:
-    """Exchange items i and j where the condition holds."""
+    """Exchange items i and j of the list, in place, where the condition holds: by selections, without a branch."""
     a, b = items[i], items[j]
     items[i], items[j] = jnp.where(condition, b, a), jnp.where(condition, a, b)
 
@@ -246,22 +256,31 @@ def _lu(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Val
 
 @cache
 def _trace_lu(n: int, dtype: Any) -> ClosedJaxpr:
-    """Return `lu` of a matrix (n, n), traced."""
+    """Return the program of `lu` for a matrix (n, n) of this type, as JAX traces it; cached, as it is used again."""
     with jax.enable_x64(True):
         return jax.make_jaxpr(lu)(make_placeholder((n, n), dtype))
 
 
 def _permutation(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """Return the order of rows after the exchanges of each vector of pivots."""
-    program = _trace_permutation(inputs[0].shape[-1], equation.params["permutation_size"])
-    return _decompose_each(lowering, program, equation, inputs[0])
+    """Return the order of rows after the row exchanges of an L U factorisation, by `permutation` written out.
+
+    The input has the pivots of each matrix along its last axis: row j was exchanged with row pivots[j].
+    """
+    pivots = inputs[0]
+    program = _trace_permutation(pivots.shape[-1], equation.params["permutation_size"])
+    return _decompose_each(lowering, program, equation, pivots)
 
 
 @cache
 def _trace_permutation(count: int, size: int) -> ClosedJaxpr:
-    """Return `permutation` of so many pivots, traced."""
+    """Return the program of `permutation` for `count` pivots and `size` rows, as JAX traces it.
+
+    Pivot j of an L U factorisation is the row with which row j is exchanged; the program returns the resulting order of
+    rows. Native code is written from such programs of JAX, and this one is traced once for each pair of sizes.
+    """
+    pivots = make_placeholder((count,), np.int32)
     with jax.enable_x64(True):
-        return jax.make_jaxpr(lambda pivots: permutation(pivots, size))(make_placeholder((count,), np.int32))
+        return jax.make_jaxpr(lambda pivots: permutation(pivots, size))(pivots)
 
 
 def _linear_solve(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:

@@ -26,7 +26,7 @@ WORDS: dict[Type, tuple[Type, Type]] = {"f64": ("u64", "i64"), "f32": ("u32", "i
 
 
 def broadcast_entries(arrays: Sequence[np.ndarray], shape: tuple[int, ...]) -> list[list[Any]]:
-    """Return a list of entries for each array, broadcast to `shape` and in row-major order."""
+    """Return for each array of nodes the list of its entries, broadcast to `shape`, in row-major order."""
     size = math.prod(shape)
     return [
         [a.item()] * size if a.size == 1 else (a if a.shape == shape else np.broadcast_to(a, shape)).ravel().tolist()
@@ -35,7 +35,7 @@ def broadcast_entries(arrays: Sequence[np.ndarray], shape: tuple[int, ...]) -> l
 
 
 def _make_elementwise_rule(op: str) -> Rule:
-    """Return the rule of an operation that is applied to each entry."""
+    """Return the rule of an operation of JAX that is the operation `op` of native code, applied to each entry."""
 
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
         """Return an array of nodes: entry i of the result is `op` applied to entry i of each argument."""
@@ -47,7 +47,11 @@ def _make_elementwise_rule(op: str) -> Rule:
 
 
 def _make_rule_of_entries(function: Any) -> Rule:
-    """Return the rule that makes each entry of the result by function(graph, type, parameters, *entries)."""
+    """Return the rule that makes each entry of the result by function(graph, type, parameters, *entries).
+
+    It adds scalar operations (nodes) to the graph: `type` is the result's, `parameters` are those of JAX's operation,
+    and the entries are one node of each argument.
+    """
 
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
         """Return an array of nodes: entry i is what `function` makes of entry i of each argument."""
@@ -59,7 +63,7 @@ def _make_rule_of_entries(function: Any) -> Rule:
 
 
 def select(graph: Graph, condition: Node, a: Any, b: Any) -> Any:
-    """Return the node of "a if condition else b"; random keys are selected word by word."""
+    """Return the node of "a if condition else b", an operation of each run; random keys are selected word by word."""
     if isinstance(a, RandomKey):
         return RandomKey(select(graph, condition, a.first, b.first), select(graph, condition, a.second, b.second))
     return graph.node("select", a.type, condition, a, b)
@@ -90,14 +94,17 @@ def _lower_select_n(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndar
 
 
 def _raise_to_integer(graph: Graph, type: Type, params: Any, x: Node) -> Node:
-    """Return the node of x^n by repeated squaring, with the integer n = params["y"]; for n < 0 it is 1 / x^-n."""
-    exponent = abs(params["y"])
-    factors, power = [], x  # power: x, x^2, x^4, ..., one for each bit of the exponent from the lowest on
-    while exponent:
-        if exponent % 2:
+    """Return the node of x^n by repeated squaring, with the integer n = params["y"]; for n < 0 it is 1 / x^-n.
+
+    With the binary digits b_0, b_1, ... of |n|, x^|n| is the product of x^(2^i) over the i with b_i = 1.
+    """
+    remaining_digits = abs(params["y"])
+    factors, power = [], x  # power: x, x^2, x^4, ..., one for each binary digit from the lowest on
+    while remaining_digits:
+        if remaining_digits % 2:
             factors.append(power)
-        exponent //= 2
-        if exponent:
+        remaining_digits //= 2
+        if remaining_digits:
             power = graph.node("mul", type, power, power)
     unit = graph.constant(1.0 if type in REAL else 1, type)
     product = reduce(lambda a, b: graph.node("mul", type, a, b), factors, unit)
@@ -105,22 +112,22 @@ def _raise_to_integer(graph: Graph, type: Type, params: Any, x: Node) -> Node:
 
 
 def _power_of_number(graph: Graph, type: Type, params: Any, x: Node, exponent: Node) -> Node:
-    """Compute x^y of a real x, of an integer y too."""
+    """Return the node of x^y for a real x; an integer exponent y is converted to the type of x."""
     return graph.node("pow", type, x, exponent if exponent.type == type else graph.node("convert", type, exponent))
 
 
 def _clamp(graph: Graph, type: Type, params: Any, low: Node, x: Node, high: Node) -> Node:
-    """Return x between `low` and `high`."""
+    """Return the node of x limited to the range from `low` to `high`: min(max(low, x), high)."""
     return graph.node("min", type, graph.node("max", type, low, x), high)
 
 
 def _convert(graph: Graph, type: Type, params: Any, x: Node) -> Node:
-    """Return x as a number of the result's type."""
+    """Return the node of x converted to `type`, that of the result."""
     return graph.node("convert", type, x)
 
 
 def _bitcast(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Return numbers whose bits are read as another type.
+    """Return an array of nodes of numbers whose bits are read as another type.
 
     The other type has as many bits, or a number of 64 bits becomes two words of 32 bits, the low one first.
     """
@@ -146,22 +153,22 @@ def _logistic(graph: Graph, type: Type, params: Any, x: Node) -> Node:
 
 
 def _root_reciprocal(graph: Graph, type: Type, params: Any, x: Node) -> Node:
-    """Return 1 / sqrt(x)."""
+    """Return the node of 1 / sqrt(x); the operation's `params` are not used."""
     return graph.node("div", type, graph.constant(1.0, type), graph.node("sqrt", type, x))
 
 
 def _square(graph: Graph, type: Type, params: Any, x: Node) -> Node:
-    """Return x^2."""
+    """Return the node of x^2 = x x; the operation's `params` are not used."""
     return graph.node("mul", type, x, x)
 
 
 def _one_minus_square(graph: Graph, type: Type, params: Any, x: Node) -> Node:
-    """Return 1 - x^2."""
+    """Return the node of 1 - x^2; the operation's `params` are not used."""
     return graph.node("sub", type, graph.constant(1.0, type), graph.node("mul", type, x, x))
 
 
 def _log2(graph: Graph, type: Type, params: Any, x: Node) -> Node:
-    """Return log x / log 2."""
+    """Return the node of the binary logarithm, log(x) (1 / log 2); the operation's `params` are not used."""
     return graph.node("mul", type, graph.node("log", type, x), graph.constant(1 / math.log(2), type))
 
 
@@ -174,17 +181,23 @@ def _polynomial(graph: Graph, type: Type, params: Any, x: Node, *coefficients: N
 
 
 def _round(graph: Graph, type: Type, params: Any, x: Node) -> Node:
-    """Return the nearest whole number, of halves the even one or that further from zero."""
+    """Return the node of the whole number nearest to x; of halves the even one, or the one further from zero.
+
+    JAX's `rounding_method` is 1 for the even one and 0 for the other.
+    """
     return graph.node("round_even" if int(params["rounding_method"]) else "round_away", type, x)
 
 
 def _return_arguments(lowering: Lowering, equation: JaxprEqn, inputs: list[Any]) -> list[Any]:
-    """Return the arguments: an operation that changes no number."""
+    """Return the arguments as they are: the rule of an operation that changes no number, such as `copy`."""
     return inputs
 
 
 def _make_total_order_rule(op: str) -> Callable[..., Node]:
-    """Return the comparison by the total order of IEEE 754, -NaN < -inf < ... < -0 < 0 < ... < inf < NaN."""
+    """Return the function that makes the node of a comparison `op` ("eq", "le" or "lt") by the total order of IEEE 754.
+
+    That order is -NaN < -inf < ... < -0 < 0 < ... < inf < NaN; the function compares integers that have it.
+    """
 
     def rank_by_bits(graph: Graph, x: Node) -> Node:
         """Return an unsigned integer made of a real number's bits, such that integers have the order of the reals.
@@ -200,7 +213,11 @@ def _make_total_order_rule(op: str) -> Callable[..., Node]:
         sign = graph.constant(1 << highest, word)
         return graph.node("xor", word, bits, graph.node("or", word, all_if_negative, sign))
 
-    return lambda graph, type, params, x, y: graph.node(op, type, rank_by_bits(graph, x), rank_by_bits(graph, y))
+    def compare_by_rank(graph: Graph, type: Type, params: Any, x: Node, y: Node) -> Node:
+        """Return the node of `x op y` by the total order."""
+        return graph.node(op, type, rank_by_bits(graph, x), rank_by_bits(graph, y))
+
+    return compare_by_rank
 
 
 def _next_after(graph: Graph, type: Type, params: Any, x: Node, y: Node) -> Node:
@@ -224,7 +241,7 @@ def _next_after(graph: Graph, type: Type, params: Any, x: Node, y: Node) -> Node
 
 
 def _shift_right_arithmetic(graph: Graph, type: Type, params: Any, x: Node, by: Node) -> Node:
-    """Return x >> by, with copies of the sign from the left."""
+    """Return the node of x shifted right by `by` bits, with copies of the sign bit from the left."""
     return graph.node("shift_right_signed", type, x, by)
 
 

@@ -45,7 +45,8 @@ def _gather(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) ->
 def _is_inside(lowering: Lowering, equation: JaxprEqn, shape: tuple[int, ...], indices: np.ndarray) -> np.ndarray:
     """Return for each row of indices the node of a flag: whether its window lies inside an array of this shape.
 
-    A row holds the window's first index along each of the operation's axes. `slice_sizes` is the window's shape.
+    A node is an operation of the program, since data may decide an index. A row holds the window's first index along
+    each axis of `start_index_map`. `slice_sizes` is the window's shape.
     """
     axes, sizes = equation.params["dimension_numbers"].start_index_map, equation.params["slice_sizes"]
     flags = np.full(indices.shape[:-1], lowering.graph.constant(True, "bool"), dtype=object)
@@ -76,11 +77,17 @@ def _gather_clipped(equation: JaxprEqn, lowering: Lowering, x: np.ndarray, indic
 def _find_gathered_indices(
     shape: tuple[int, ...], sizes: tuple[int, ...], indices: bytes, of: tuple[int, ...], numbers: GatherDimensionNumbers
 ) -> np.ndarray:
-    """Return the indices in the flat array of this `shape` that a gather takes at known indices.
+    """Return which entries of the flat array a gather of JAX takes at known indices, as an array of the result's shape.
 
-    `indices` are the bytes of an int64 array of shape `of`. They have the axes of the result: those of the
-    indices without the last, with the window's axes (`offset_dims`) among them. The answer is cached, since a filter
-    makes each gather a dozen times.
+    The result has the axes of the indices but the last, with a window's axes (`numbers.offset_dims`) among them. The
+    answer is cached, since a filter makes each gather a dozen times; so all arguments have a hash.
+
+    Args:
+        shape: of the array, whose entries are in row-major order.
+        sizes: of a window, along each axis of the array.
+        indices: the bytes of the int64 array of indices, whose last axis has the start of a window.
+        of: shape of that array.
+        numbers: JAX's description of which axes are which.
     """
     known = np.frombuffer(indices, dtype=np.int64).reshape(of)
     batching = list(zip(numbers.operand_batching_dims, numbers.start_indices_batching_dims, strict=True))
@@ -91,17 +98,19 @@ def _find_gathered_indices(
 
 
 def _gather_by_cases(lowering: Lowering, equation: JaxprEqn, x: np.ndarray, indices: np.ndarray) -> np.ndarray:
-    """Gather at indices (..., axis) that depend on data: one gather for each possible value, then a selection.
+    """Return the windows of x at indices (..., k) that data decide: gathered for each possible index, then selected.
 
-    Each entry is selected by the index of its own row alone, so that rows of many nodes need no more cases than one.
+    Entry (..., j) is the first index of a window along the array's axis start_index_map[j]. One column j that depends
+    on data is replaced by each of its possible values in turn; other such columns are met in these gathers. Each entry
+    of the result is selected by the index of its own window alone.
     """
     numbers, sizes = equation.params["dimension_numbers"], equation.params["slice_sizes"]
     column = next(j for j in range(indices.shape[-1]) if known_integers(indices[..., j]) is None)
     axis = numbers.start_index_map[column]
-    last = x.shape[axis] - sizes[axis]
-    if last >= FEW:
+    last_start = x.shape[axis] - sizes[axis]  # at which a window is still inside x
+    if last_start >= FEW:
         return _gather_from_memory(lowering, equation, x, indices, column)
-    known_cases = [_replace_indices(lowering, indices, column, index) for index in range(last + 1)]
+    known_cases = [_replace_indices(lowering, indices, column, start) for start in range(last_start + 1)]
     cases = [_gather_clipped(equation, lowering, x, known) for known in known_cases]
     selected = cases[-1].copy()
     for entry in np.ndindex(*selected.shape):
@@ -169,7 +178,10 @@ def _replace_indices(lowering: Lowering, indices: np.ndarray, column: int, numbe
 
 
 def _find_index_row(entry: tuple[int, ...], numbers: Any) -> tuple[int, ...]:
-    """Return the row of indices from which an entry of the result is gathered."""
+    """Return the index of the window that an entry of a gather's result comes from.
+
+    The result's axes are those of the windows, with the axes within a window (`numbers.offset_dims`) among them.
+    """
     return tuple(i for axis, i in enumerate(entry) if axis not in numbers.offset_dims)
 
 

@@ -15,7 +15,10 @@ from straightline.strided_arrays import contiguous_strides
 
 
 def clamp_start(lowering: Lowering, start: Node, last: int) -> Node | int:
-    """Return a start clamped between 0 and `last`: a number if it is known, else a node of type i64."""
+    """Return the start of a window, moved into the range from 0 to `last`, the last one at which the window fits.
+
+    It is a number if the start is a constant, else a node (an operation of the program) of type i64.
+    """
     if last == 0:
         return 0
     if start.op == "constant":
@@ -29,7 +32,10 @@ def clamp_start(lowering: Lowering, start: Node, last: int) -> Node | int:
 
 
 def is_inside(graph: Graph, start: Node, last: int) -> Node:
-    """Return the node of the flag 0 <= start <= last; an unsigned number needs no test against 0."""
+    """Return the node of the flag 0 <= start <= last, computed when the program runs.
+
+    `start` may be of any integer type; an unsigned number needs no test against 0.
+    """
     is_at_most_last = graph.node("le", "bool", start, graph.constant(last, start.type))
     if start.type[0] == "u":
         return is_at_most_last
@@ -43,7 +49,7 @@ def fills_outside(equation: JaxprEqn) -> bool:
 
 
 def convert_to_32_bits(lowering: Lowering, indices: np.ndarray) -> np.ndarray:
-    """Return indices that may be outside converted to 32 bits with a sign, as JAX does."""
+    """Return indices, an array of nodes, converted to 32 bits with a sign, as JAX does where they may be outside."""
     nodes = [lowering.graph.node("convert", "i32", n) for n in indices.ravel().tolist()]
     return arrange_nodes(nodes, indices.shape)
 

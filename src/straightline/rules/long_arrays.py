@@ -37,7 +37,7 @@ OF_ENTRIES = (
 
 
 def is_long(inputs: list[Value]) -> bool:
-    """Return whether an argument of an operation is too long to have a node for each of its entries.
+    """Return whether an argument of an operation is too long to have a node (scalar operation) for each of its entries.
 
     Arrays of nodes are never too long. Of arrays in memory, the longest one counts: more than LOADED numbers are too
     long, and TABLE or fewer are not. In between it is too long unless all arrays in memory are tables of constants, and
@@ -74,7 +74,11 @@ def _are_written_out(inputs: list[Value], count: int) -> bool:
 
 
 def _make_row_by_row_rule(name: str) -> Rule:
-    """Return the rule of an elementwise operation: of short arrays at once, of long ones row by row in a loop."""
+    """Return the rule of JAX's elementwise operation `name`, for arrays that may be in memory.
+
+    The numbers of short arrays are loaded, and each entry of the result is a scalar operation of its own. Of long
+    arrays the result is computed row by row, in a loop of the program.
+    """
 
     def lower_row_by_row(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
         """Lower an operation of entries (`name`): of long arrays one row of the result after another, in a loop.
@@ -89,7 +93,7 @@ def _make_row_by_row_rule(name: str) -> Rule:
         row_equation = make_row_equation(equation)
 
         def body(row: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
-            """Return no carry, and the operation's result for one row."""
+            """Return no carry, and the operation's result for the row with the number `row`, a node."""
             rows = [take_row_of_argument(lowering, x, row, ndim) for x in items]
             return [], list(lowering.lower_equation(row_equation, rows))
 
@@ -120,11 +124,13 @@ def take_row_of_argument(lowering: Lowering, x: Value, row: Node, ndim: int) -> 
 
 
 def make_row_equation(equation: JaxprEqn, **params: Any) -> Any:
-    """Return a stand-in for an operation that a rule can lower for one row: its results lack the first axis.
+    """Return an operation of JAX as it is for one row of its results, so that the loop over rows can lower it.
 
-    `params` replace parameters of the operation.
+    The loop's body passes it to the operation's rule, in the place of the whole operation (`equation`). It has the same
+    attributes, but its results lack the first axis. Of the arguments rules read the types alone, so that they stay as
+    they are. `params` replace parameters of the operation, such as axes, which have other numbers in a row.
     """
-    avals: list[Any] = [v.aval for v in equation.outvars]
+    avals: list[Any] = [v.aval for v in equation.outvars]  # shapes and types of the results
     rows = [SimpleNamespace(aval=make_placeholder(a.shape[1:], a.dtype)) for a in avals]
     return SimpleNamespace(
         primitive=equation.primitive, params=equation.params | params, outvars=rows, invars=equation.invars,
@@ -180,7 +186,7 @@ def _multiply_by_row(lowering: Lowering, equation: JaxprEqn, a: StridedArray, b:
     by_row = [(x if axis is None else _move_to_front(x, axis), axis) for x, axis in ((a, a_axis), (b, b_axis))]
 
     def multiply_row(row: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """Return no carry, and the product for one row."""
+        """Return no carry, and the product for one row; `row` is the node of the loop's counter."""
         rows: list[Value] = [x if axis is None else x.row(row) for x, axis in by_row]
         return load_as_nodes(lowering, ([], list(lowering.lower_equation(row_equation, rows))))
 
@@ -193,24 +199,27 @@ def _multiply_by_row(lowering: Lowering, equation: JaxprEqn, a: StridedArray, b:
 
 
 def _find_free_axis(x: StridedArray, contracted: Sequence[int]) -> int | None:
-    """Return the first axis that is not summed over; None if all are."""
+    """Return the first axis of x that is not among the axes that are summed over (`contracted`); None if all are."""
     return next((d for d in range(x.ndim) if d not in contracted), None)
 
 
 def _multiply_nodes(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> Sequence[Value]:
-    """Return a product of arrays of nodes, written out or as a loop over rows.
+    """Return the product of two arrays (JAX's `dot_general`) whose entries are nodes, the program's scalar operations.
 
-    It is a loop if there are more than MANY_TERMS terms. A batch of matrices, and a sum over several axes, is always
-    written out.
+    It is written out term by term, or if a product of two matrices has more than MANY_TERMS terms, made a loop over the
+    rows of arrays in memory. A batch of matrices, and a sum over several axes, is always written out.
     """
-    (left, right), (batch, _) = equation.params["dimension_numbers"]
-    if batch or len(left) != 1 or _count_terms(inputs[0], left[0], inputs[1], right[0]) <= MANY_TERMS:
-        return write_product(lowering, equation, inputs)
-    return _dot_general(lowering, equation, [put_in_memory(lowering, x) for x in inputs])
+    a, b = inputs
+    # Axes of a and of b that are summed over, and axes that both share with the result.
+    (a_summed, b_summed), (batch_axes, _) = equation.params["dimension_numbers"]
+    is_matrix_product = not batch_axes and len(a_summed) == 1
+    if is_matrix_product and _count_terms(a, a_summed[0], b, b_summed[0]) > MANY_TERMS:
+        return _dot_general(lowering, equation, [put_in_memory(lowering, x) for x in inputs])
+    return write_product(lowering, equation, inputs)
 
 
 def _count_terms(a: np.ndarray, left: int, b: np.ndarray, right: int) -> int:
-    """Return how many terms the product of a and b has, without terms that have a known zero as a factor.
+    """Return how many terms a_k b_k the product of a and b has, without terms that have a known zero as a factor.
 
     The product sums over axis `left` of a and axis `right` of b. The answer is 0 if the terms are at most MANY_TERMS
     even with zeros: they are then not counted.
@@ -222,14 +231,20 @@ def _count_terms(a: np.ndarray, left: int, b: np.ndarray, right: int) -> int:
 
 
 def _count_nonzero_entries(x: np.ndarray, axis: int) -> np.ndarray:
-    """Return for each index along an axis how many of the entries there are not known to be zero."""
+    """Return for each index along an axis how many of the entries there are not known to be zero.
+
+    x is an array of nodes, the program's scalar operations; a constant node of 0 is a known zero.
+    """
     is_data = np.array([n.op != "constant" or bool(n.value) for n in x.ravel().tolist()]).reshape(x.shape)
     counts: np.ndarray = np.moveaxis(is_data, axis, -1).reshape(-1, x.shape[axis]).sum(0)
     return counts
 
 
 def _sum_iterations(lowering: Lowering, equation: JaxprEqn, count: int, body: LoopBody) -> list[Value]:
-    """Return the sum of the numbers that `body` returns to be stacked, over the `count` iterations of a loop."""
+    """Return the sum of the numbers that `body` returns to be stacked, over the `count` iterations of a loop.
+
+    The loop is one of the program that is being written. Its carry is the sum so far, an array of one node.
+    """
     sum_along_first: Any = SimpleNamespace(params={"axes": (0,)}, outvars=equation.outvars)
 
     def add_number(row: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
@@ -294,18 +309,21 @@ def _find_nonzero_entries(graph: Graph, type: Type, row: np.ndarray) -> dict[int
 
 
 def _move_to_front(x: StridedArray, axis: int) -> StridedArray:
-    """Return a view with this axis first."""
+    """Return a view of the same memory with this axis first, and the other axes in their order."""
     order = [axis, *(a for a in range(x.ndim) if a != axis)]
     return x.view([x.shape[a] for a in order], [x.strides[a] for a in order])
 
 
 def _renumber_axes(axes: Sequence[int], removed: int | None) -> tuple[int, ...]:
-    """Return the numbers of these axes in an array without the removed axis, or as they are if none is."""
+    """Return the numbers that these axes have in an array without the axis `removed`; None removes none."""
     return tuple(axes) if removed is None else tuple(a - (a > removed) for a in axes)
 
 
 def _make_reduction_rule(name: str) -> Rule:
-    """Return the rule of a reduction, such as `reduce_sum`: short arrays at once, long ones row by row."""
+    """Return the rule of JAX's reduction `name`, such as `reduce_sum`, for arrays that may be in memory.
+
+    Short arrays are loaded and reduced number by number; long ones are reduced in a loop over their rows.
+    """
 
     def lower_reduction(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
         """Lower the reduction `name` of an array along the operation's axes; a long array is reduced row by row."""
@@ -341,7 +359,7 @@ def _reduce_long(lowering: Lowering, equation: JaxprEqn, name: str, x: Value) ->
         return [], [reduce_row(index)]
 
     def accumulate_row(index: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """Return the rows reduced so far with this one, and nothing to stack."""
+        """Return the reduction of the rows so far and of row `index` as the carry, and nothing to stack."""
         pair = np.stack([carry[0], reduce_row(index)])
         return [np.asarray(RULES[name](lowering, of_two_rows, [pair])[0])], []
 

@@ -1,6 +1,5 @@
 """Rules of loops: short ones are written out; long ones stay loops with stacked results in memory, as does `while`."""
 
-import math
 from collections.abc import Callable, Sequence
 from functools import reduce
 from typing import Any, NamedTuple
@@ -9,12 +8,13 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, JaxprEqn
 
 from straightline.graph import Graph
-from straightline.lowering import IN_MEMORY, Lowering, Value, arrange_nodes, list_nodes
+from straightline.lowering import IN_MEMORY, Lowering, Value, arrange_nodes, estimate_size, list_nodes
 from straightline.nodes import Block, Buffer, Loop, LoopExit, Node, RandomKey, Type, Unsupported
 from straightline.rules.elementwise import select
 from straightline.size_limits import WRITTEN_OUT
 from straightline.strided_arrays import StridedArray
 
+# (row, carry before an iteration) -> (carry after it, arrays that are stacked), as arrays of nodes
 LoopBody = Callable[[Node, list[np.ndarray]], tuple[Sequence[np.ndarray], Sequence[np.ndarray]]]
 
 
@@ -82,21 +82,26 @@ def _lower_loop(
 
 
 def _make_carried_nodes(graph: Graph, op: str, loop: Loop, block: Block) -> list[Node]:
-    """Make a node for each carried number, which stands for it in the body ("parameter") or after it ("result")."""
+    """Make a node for each number that a loop carries: it stands for the number in the body, or after the loop.
+
+    `op` is "parameter" or "result" accordingly, and `block` the body or the block around the loop.
+    """
     return [graph.make_fresh_node(op, n.type, (), block, (loop, index)) for index, n in enumerate(loop.initial)]
 
 
 def is_symmetric(x: np.ndarray) -> bool:
-    """Return whether matrices (..., n, n) with n > 1 are symmetric: entries (i, j) and (j, i) are the same node."""
+    """Return whether matrices of nodes (..., n, n), n > 1, are symmetric: entries (i, j) and (j, i) are one node."""
     if x.ndim < 2 or x.shape[-1] != x.shape[-2] or not x.size or x.shape[-1] == 1:
         return False
     return all(a is b for a, b in zip(x.ravel().tolist(), np.swapaxes(x, -1, -2).ravel().tolist(), strict=True))
 
 
 def _flatten_carry(arrays: Sequence[np.ndarray], halves: Sequence[bool]) -> list[Node]:
-    """Return the nodes of arrays, of those marked the upper triangles alone."""
-    parts = [x[..., *np.triu_indices(x.shape[-1])] if h else x for x, h in zip(arrays, halves, strict=True)]
-    return [n for x in parts for n in list_nodes(x)]
+    """Return the nodes of arrays as one list; of a symmetric matrix, marked in `halves`, only the upper triangle's."""
+    nodes: list[Node] = []
+    for x, is_halved in zip(arrays, halves, strict=True):
+        nodes += list_nodes(x[..., *np.triu_indices(x.shape[-1])] if is_halved else x)
+    return nodes
 
 
 def _store_row(
@@ -158,16 +163,19 @@ def _mirror_triangles(upper: np.ndarray, n: int) -> np.ndarray:
 
 
 def _lower_scan(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """Lower `scan`, and return its carry and then what it stacks.
+    """Return the results of JAX's `scan`, its last carry and then what it stacks, as operations of the program.
 
     If all iterations together compute at most `written_out` numbers, they are written out one after another. Else the
-    scan becomes a loop. The arguments are constants, the carry, and arrays of which each iteration gets a row.
+    scan becomes a loop. The arguments are in this order what is the same in all iterations, the carry, and arrays of
+    which each iteration gets a row.
     """
     params = equation.params
-    (consts, carried), length = _count_scan_arguments(params), params["length"]
-    fixed, carry, rows = inputs[:consts], inputs[consts : consts + carried], inputs[consts + carried :]
-    size = length * estimate_size(lowering, params["jaxpr"].jaxpr)
-    if size <= lowering.written_out or length <= 1:  # a loop of one iteration would be no shorter
+    fixed_count, carry_count = _count_scan_arguments(params)
+    fixed, others = inputs[:fixed_count], inputs[fixed_count:]
+    carry, rows = others[:carry_count], others[carry_count:]
+    length = params["length"]
+    computed_numbers = length * estimate_size(lowering, params["jaxpr"].jaxpr)
+    if computed_numbers <= lowering.written_out or length <= 1:  # a loop of one iteration would be no shorter
         return _write_out_scan(lowering, equation, fixed, [lowering.nodes(x) for x in carry], rows)
     return _lower_long_scan(lowering, equation, fixed, carry, rows)
 
@@ -201,14 +209,10 @@ def _lower_long_scan(
 class _ScanBody(NamedTuple):
     """The body of a scan that stays a loop, and how its arguments are held.
 
-    Args:
-        lowering: the program that the loop is a part of.
-        program: the body, of the fixed arguments, all carried arrays, and a row of each stacked array.
-        fixed: arguments that are the same in each iteration.
-        carry: all carried arrays as they begin; one that is in neither of the next two stays as it is.
-        as_numbers: which of them are carried as nodes, one for each number.
-        in_memory: the memory of the others, by their index in the carry.
-        rows: arrays in memory, of which an iteration has one row.
+    program: the body, of the fixed arguments (the same in each iteration), all carried arrays, and a row of each
+    stacked array. carry: all carried arrays as they begin; one that is in neither of the next two stays as it is.
+    as_numbers: which of them are carried as nodes, one for each number. in_memory: the memory of the others, by their
+    index in the carry. rows: arrays in memory, of which an iteration has one row.
     """
 
     lowering: Lowering
@@ -236,19 +240,23 @@ class _ScanBody(NamedTuple):
 
 
 class CarriedMemory:
-    """Memory of an array that a loop carries and that is too long for numbers of its own.
+    """Memory of an array that a loop carries and that is too long to be carried as single numbers.
 
     An iteration reads it, and fills it anew at its end; each run has its own, whatever it is computed from.
     """
 
     def __init__(self, lowering: Lowering, start: Value):
-        """Make memory for an array that a loop carries; `start` is copied into it before the first iteration."""
+        """Make memory for an array that a loop carries, and add a copy of `start` into it before the loop.
+
+        `lowering` holds the program that is being written, whose open block is that around the loop.
+        """
         self._graph = lowering.graph
-        self.memory = copy_in_memory(lowering, put_in_memory(lowering, start)).buffer
-        self.memory.kind = "carried"
+        copied = copy_in_memory(lowering, put_in_memory(lowering, start))
+        self.memory = copied.buffer
+        self.memory.kind = "carried"  # memory that each iteration of a loop overwrites, unlike "scratch" memory
 
     def view_in_iteration(self) -> StridedArray:
-        """Return the array as an iteration reads it; the loop's body must be the graph's open block."""
+        """Return the array as an iteration of the loop reads it; the loop's body must be the graph's open block."""
         self.memory.parts = []  # a body may be lowered twice: forget what filled the memory in the first try
         return self.view_from_here()
 
@@ -257,11 +265,11 @@ class CarriedMemory:
         return self._view_part(Buffer("scratch", self.memory.type, self.memory.shape, self._graph.current))
 
     def fill(self, lowering: Lowering, x: StridedArray) -> None:
-        """Fill the memory with an array that is elsewhere."""
-        self._view_part(copy_in_memory(lowering, x).buffer)
+        """Add a copy of `x`, an array in other memory, into this memory; the open block is the loop's body."""
+        self._view_part(copy_in_memory(lowering, x).buffer)  # the copy's buffer lies inside this memory
 
     def _view_part(self, buffer: Buffer) -> StridedArray:
-        """Place a buffer in this memory; return the view of it."""
+        """Make a buffer of the same size a part of this memory, from its first number on; return the view of it."""
         self.memory.place_buffer_inside(buffer, 0)
         return StridedArray.of_whole_buffer(buffer)
 
@@ -297,7 +305,15 @@ def _count_scan_arguments(params: dict[str, Any]) -> tuple[int, int]:
 def _write_out_scan(
     lowering: Lowering, equation: JaxprEqn, fixed: list[Value], carry: list[Value], rows: list[Value]
 ) -> list[Value]:
-    """Lower a short `scan` as its iterations, one after another; return its carry, then the results that it stacks."""
+    """Return the results of a short `scan`, its carry, then what it stacks, from its iterations one after another.
+
+    Args:
+        lowering: the program to which the operations of each iteration are added.
+        equation: the scan.
+        fixed: arguments that are the same in all iterations.
+        carry: the carry before the first iteration.
+        rows: arrays of which each iteration gets a row.
+    """
     params = equation.params
     stacked: list[list[Value]] = []
     numbers = range(params["length"])
@@ -315,12 +331,15 @@ def _write_out_scan(
 
 
 def _take_row(x: np.ndarray, i: int) -> np.ndarray:
-    """Return x[i] as an array, also for one axis."""
+    """Return x[i] as an array; of an array with one axis too, where NumPy's x[i] would be an entry itself."""
     return x[i : i + 1].reshape(x.shape[1:])
 
 
 def put_in_memory(lowering: Lowering, value: Value) -> StridedArray:
-    """Return an array in memory: constants become a table, and other nodes are stored one by one in a new buffer."""
+    """Return an array in memory, so that data can choose among its entries.
+
+    An array of nodes is stored: constants become a table of the program, others a buffer that the open block fills.
+    """
     if isinstance(value, StridedArray):
         return value
     flat = _list_nodes_of_numbers(value)
@@ -336,8 +355,9 @@ def put_in_memory(lowering: Lowering, value: Value) -> StridedArray:
 
 
 def copy_in_memory(lowering: Lowering, x: StridedArray) -> StridedArray:
-    """Copy a long array to new memory, row by row in a loop; return the copy."""
-    return make_counted_loop(lowering, x.shape[0], [], lambda row, _: ([], [lowering.nodes(x.row(row))]))[1][0]
+    """Copy a long array to new memory, row by row in a loop that is added to the program; return the copy."""
+    _carry, stacked = make_counted_loop(lowering, x.shape[0], [], lambda row, _: ([], [lowering.nodes(x.row(row))]))
+    return stacked[0]
 
 
 def _lower_while(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
@@ -365,35 +385,14 @@ def _lower_while(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
 
 
 def _select_where_active(graph: Graph, active: np.ndarray, new: np.ndarray, old: np.ndarray) -> np.ndarray:
-    """Return new entries where a loop goes on (`active`), and the old ones elsewhere.
+    """Return the nodes that select the new entries where a loop goes on (`active`), and the old ones elsewhere.
 
-    `active` holds a flag for each item of a batch, along leading axes. It is repeated for all entries of the item.
+    A node is a scalar operation of the program (`graph`). `active` holds a flag for each item of a batch, along the
+    leading axes of `new` and `old`, and is repeated for all entries of the item.
     """
     conditions = np.repeat(active.ravel(), new.size // active.size).tolist()
     entries = zip(conditions, new.ravel().tolist(), old.ravel().tolist(), strict=True)
     return arrange_nodes([select(graph, condition, x, y) for condition, x, y in entries], old.shape)
-
-
-def estimate_size(lowering: Lowering, jaxpr: Any) -> int:
-    """Return an estimate of how many numbers a traced program computes; `lowering.sizes` keeps the answers.
-
-    The body of a scan counts once for each iteration, and that of a while loop counts once.
-    """
-    if jaxpr in lowering.sizes:
-        return lowering.sizes[jaxpr]
-    total = 0
-    for equation in jaxpr.eqns:
-        inner = [estimate_size(lowering, getattr(p, "jaxpr", p)) for p in _list_inner_programs(equation.params)]
-        length = equation.params["length"] if equation.primitive.name == "scan" else 1
-        total += length * sum(inner) + sum(math.prod(v.aval.shape) for v in equation.outvars)
-    lowering.sizes[jaxpr] = total
-    return total
-
-
-def _list_inner_programs(params: dict[str, Any]) -> list[Any]:
-    """Return the programs among the parameters of an operation."""
-    values = [x for p in params.values() for x in (p if isinstance(p, tuple) else (p,))]
-    return [x for x in values if hasattr(x, "eqns") or hasattr(x, "jaxpr")]
 
 
 IN_MEMORY |= {"scan": _lower_scan, "while": _lower_while}

@@ -15,7 +15,10 @@ from straightline.nodes import REAL, Node, Type, Unsupported
 
 
 def combine_nodes(graph: Graph, op: str, type: Type, nodes: Sequence[Node], empty: float) -> Node:
-    """Return the node of n_0 op n_1 op n_2 ..., from the left; the constant `empty` if there are no nodes."""
+    """Return the node of n_0 op n_1 op n_2 ..., from the left; the constant `empty` if there are no nodes.
+
+    Nodes are scalar operations of the program that is being written, `graph`; those of this chain are added to it.
+    """
     if not nodes:
         return graph.constant(empty, type)
     return reduce(lambda a, b: graph.node(op, type, a, b), nodes)
@@ -28,7 +31,7 @@ def _make_reduction_rule(op: str, empty: float) -> Rule:
     """
 
     def lower_operation(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-        """Return the array reduced by `op` along the operation's axes; where there are no entries it is `empty`."""
+        """Return an array of nodes reduced by `op` along the operation's axes; of no entries the result is `empty`."""
         axes, shape, type = equation.params["axes"], result_shape(equation), result_type(equation)
         # Make a row of terms for each entry of the result; a reduction of no entries has rows of length 0.
         terms = math.prod(inputs[0].shape[axis] for axis in axes)
@@ -63,10 +66,13 @@ def _replace_not_finite(type: Type, number: float) -> float:
 
 
 def _make_accumulation_rule(op: str) -> Rule:
-    """Return the rule that accumulates along an axis by `op`."""
+    """Return the rule of an operation such as `cumsum`, which accumulates an array along an axis by `op`."""
 
     def lower_operation(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-        """Return the array accumulated by `op` along the operation's axis; in reverse, from its last entry on."""
+        """Return an array of nodes accumulated by `op` along the operation's axis, in reverse from its last entry on.
+
+        Entry k of the result combines entries 0 to k: each is one more scalar operation of the program.
+        """
         axis, type, reverse = equation.params["axis"], result_type(equation), equation.params["reverse"]
         if not inputs[0].size:
             return inputs
@@ -84,10 +90,17 @@ def _make_accumulation_rule(op: str) -> Rule:
 
 
 def _make_extreme_index_rule(op: str) -> Rule:
-    """Return the rule of `argmax` (op "gt") or `argmin` ("lt") along one axis."""
+    """Return the rule by which JAX's `argmax` or `argmin` is written as comparisons of numbers.
+
+    `op` is the comparison by which an entry beats the best one so far: "gt" (greater) for argmax, "lt" for argmin.
+    """
 
     def lower_argument_of_extreme(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-        """Return argmax (`op` is "gt") or argmin ("lt") of an array of nodes along the operation's only axis."""
+        """Return the indices of the extremes of an array along the operation's only axis.
+
+        The array's entries are nodes, the scalar operations of the program (`lowering.graph`), to which the comparisons
+        are added; so are the entries of the result.
+        """
         axis = equation.params["axes"][0]
         rows = np.moveaxis(inputs[0], axis, -1).reshape(-1, inputs[0].shape[axis])
         indices = [_find_first_extreme(lowering.graph, op, result_type(equation), row) for row in rows.tolist()]
@@ -114,16 +127,21 @@ def _find_first_extreme(graph: Graph, op: str, type: Type, row: list[Node]) -> N
 
 
 def write_product(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Write out `dot_general` entry by entry: a product A B' for each index of the batch axes.
+    """Write out a product of two arrays (JAX's `dot_general`) entry by entry: A B' for each index of the batch axes.
 
-    A and B are (free, contracted). The contracted axes are summed over, and the free axes are those of the result.
+    The inputs are arrays of nodes, the scalar operations of the program that is being written (`lowering.graph`). Batch
+    axes are common to both inputs and come first in the result, contracted axes are summed over, and free axes belong
+    to one input: those of the first, and then those of the second, are the result's other axes.
     """
-    (left, right), (left_batch, right_batch) = equation.params["dimension_numbers"]
-    type = result_type(equation)
-    x, y = (_convert(lowering.graph, type, x) for x in inputs)
-    a, b = _as_matrices(x, left, left_batch), _as_matrices(y, right, right_batch)
-    products = [_multiply_matrices(lowering, type, rows, columns) for rows, columns in zip(a, b, strict=True)]
-    return [arrange_nodes([n for product in products for n in product.ravel().tolist()], result_shape(equation))]
+    (x_contracted, y_contracted), (x_batch, y_batch) = equation.params["dimension_numbers"]
+    number_type = result_type(equation)
+    x, y = (_convert(lowering.graph, number_type, array) for array in inputs)
+    a = _as_matrices(x, x_contracted, x_batch)  # (batch, free axes of x, contracted)
+    b = _as_matrices(y, y_contracted, y_batch)  # (batch, free axes of y, contracted)
+    products = [_multiply_matrices(lowering, number_type, *factors) for factors in zip(a, b, strict=True)]
+    # The nodes of all products in row-major order are those of the result.
+    nodes = [n for product in products for n in product.ravel().tolist()]
+    return [arrange_nodes(nodes, result_shape(equation))]
 
 
 def _multiply_matrices(lowering: Lowering, type: Type, a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -172,7 +190,11 @@ def _is_zero_term(x: Node, y: Node) -> bool:
 
 
 def _is_weighted(a: np.ndarray, b: np.ndarray) -> bool:
-    """Return whether A = B diag(w) for some nodes w: each column of A is the column of B times one node."""
+    """Return whether A = B diag(w) for some nodes w: each column of A is the column of B times one node.
+
+    A and B are arrays of nodes (scalar operations), so that it is seen from the operations whether it holds. Then A B'
+    is B diag(w) B', which is symmetric.
+    """
     if a.shape != b.shape:
         return False
     weights = [[_find_weight(x, y) for x, y in zip(*columns, strict=True)] for columns in zip(a.T, b.T, strict=True)]
@@ -190,8 +212,12 @@ def _find_weight(x: Node, y: Node) -> Node | None:
 
 
 def _is_congruence(lowering: Lowering, a: np.ndarray, b: np.ndarray) -> bool:
-    """Return whether A was computed as B P of a symmetric P."""
-    factor, p = lowering.products.get(_make_matrix_key(a), (a[:0], a[:0]))
+    """Return whether A was computed before as B P' with a symmetric P, so that A B' = B P B' is symmetric.
+
+    `lowering.products` has the two factors of each product of matrices so far, by the product's entries.
+    """
+    no_product = (a[:0], a[:0])
+    factor, p = lowering.products.get(_make_matrix_key(a), no_product)
     return _is_same(factor, b) and _is_same(p, p.T)
 
 
@@ -201,13 +227,14 @@ def _is_same(a: np.ndarray, b: np.ndarray) -> bool:
 
 
 def _make_matrix_key(matrix: np.ndarray) -> Any:
-    """Return the shape and the nodes of a matrix, by which it is known."""
+    """Return the shape and the nodes of a matrix, row by row: equal keys are equal matrices."""
     return matrix.shape, *matrix.ravel().tolist()
 
 
 def _convert(graph: Graph, type: Type, x: np.ndarray) -> np.ndarray:
-    """Return an array in another type: integers and truth values, with which numbers may be multiplied."""
-    return arrange_nodes((n if n.type == type else graph.node("convert", type, n) for n in x.ravel().tolist()), x.shape)
+    """Return an array of nodes with each number converted to `type` where it has another one, as flags may have."""
+    nodes = [n if n.type == type else graph.node("convert", type, n) for n in x.ravel().tolist()]
+    return arrange_nodes(nodes, x.shape)
 
 
 def _as_matrices(x: np.ndarray, contracted: Sequence[int], batch: Sequence[int]) -> np.ndarray:
@@ -221,7 +248,11 @@ def _as_matrices(x: np.ndarray, contracted: Sequence[int], batch: Sequence[int])
 
 
 def _for_each_matrix(function: Any) -> Rule:
-    """Return the rule that calls function(graph, parameters, *matrices) for each matrix of a stack (..., n, m)."""
+    """Return the rule of an operation on matrices that JAX applies to each matrix of a stack (..., n, m).
+
+    function(graph, parameters, *matrices) returns the result for one matrix of each argument, as nodes of the graph,
+    the scalar operations of the program; `parameters` are those of JAX's operation.
+    """
 
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
         """Return what `function` makes of the matrices, one by one; they lie along each argument's last two axes."""
@@ -233,7 +264,7 @@ def _for_each_matrix(function: Any) -> Rule:
 
 
 def _type_of(matrix: np.ndarray) -> Type:
-    """Return the type of a matrix's numbers; of one without entries any will do."""
+    """Return the type of a matrix's numbers; of a matrix without entries "f64", since nothing is computed of it."""
     type: Type = matrix.flat[0].type if matrix.size else "f64"
     return type
 

@@ -33,13 +33,13 @@ def present(x: Shaped[jax.Array | np.ndarray, "*shape"]) -> Shaped[jax.Array, "*
 
 
 def _mark_present(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Note that the argument's numbers are never NaN, and return them."""
+    """Note in the graph that the argument's nodes (numbers that it loads or computes) are never NaN; return them."""
     lowering.graph.never_nan.update(inputs[0].ravel().tolist())
     return inputs
 
 
 def _batch_present(arrays: Sequence[jax.Array], axes: Sequence[int]) -> tuple[jax.Array, int]:
-    """Mark a batch: the axis that `vmap` maps stays where it is."""
+    """Mark the numbers of a batch under `vmap`; return them with the number of the mapped axis, which is unchanged."""
     return present(arrays[0]), axes[0]
 
 

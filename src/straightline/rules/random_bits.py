@@ -39,14 +39,17 @@ def threefry(graph: Graph, key: RandomKey, high: Node, low: Node) -> Node:
 
 
 def _new_key(graph: Graph, key: RandomKey, high: Node, low: Node) -> RandomKey:
-    """Return a new random key: the two words of the hash of a counter (words `high` and `low`) by a key."""
+    """Return a new random key: the two 32-bit words of the hash of a counter by a key.
+
+    The counter's words `high` and `low`, and the key's, are nodes: the hash is an operation of the program (`graph`).
+    """
     bits = threefry(graph, key, high, low)
     upper = graph.node("shift_right", "u64", bits, graph.constant(32, "u64"))
     return RandomKey(graph.node("convert", "u32", upper), graph.node("convert", "u32", bits))
 
 
 def _make_keys(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Return keys (...) made of words (..., 2)."""
+    """Return an array (...) of random keys made of the nodes of their two words, an array (..., 2)."""
     _check_key_type(equation.outvars[0])
     return [make_keys(inputs[0])]
 
@@ -59,7 +62,10 @@ def _read_key_words(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndar
 
 
 def _fold_in(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Return for each pair of a key and a number a new key: the hash of the words (0, number) by the key."""
+    """Return for each pair of a random key and a number a new key: the hash of the words (0, number) by the key.
+
+    The inputs are arrays of keys and of nodes, the scalar operations of the program; numbers may depend on data.
+    """
     _check_key_type(equation.invars[0])
     shape, zero = result_shape(equation), lowering.graph.constant(0, "u32")
     pairs = zip(*broadcast_entries(inputs, shape), strict=True)
@@ -67,7 +73,10 @@ def _fold_in(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -
 
 
 def _split(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Return for each key several new keys: the hashes of 0, 1, 2, ... by the key, one for each entry of a shape."""
+    """Return for each random key as many new ones as the operation's shape has entries (JAX's `split`).
+
+    New key i is the hash of the counter i by the key, an operation of the program.
+    """
     _check_key_type(equation.invars[0])
     graph, counters = lowering.graph, _make_counters(lowering.graph, equation.params["shape"])
     keys = [_new_key(graph, key, *counter) for key in inputs[0].ravel().tolist() for counter in counters]
@@ -93,7 +102,7 @@ def _bits(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> l
 
 
 def _seed(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Return for each seed, an integer, the key whose two words are its upper and its lower 32 bits."""
+    """Return for each seed, an integer node, the random key whose two words are its upper and its lower 32 bits."""
     _check_key_type(equation.outvars[0])
     graph = lowering.graph
 
@@ -120,7 +129,7 @@ def _hash_word_pairs(lowering: Lowering, equation: JaxprEqn, inputs: list[np.nda
 
 
 def _gamma(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> Any:
-    """Lower random gamma variables by JAX's own program, which is a loop until a proposal is accepted."""
+    """Return random gamma variables by JAX's own program, a loop until a proposal is accepted, written in its place."""
     gamma: Any = equation.primitive.impl
     avals: list[Any] = [v.aval for v in equation.invars]
     program = jax.make_jaxpr(lambda *args: gamma(*args, **equation.params))(*avals)
@@ -128,7 +137,7 @@ def _gamma(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> 
 
 
 def _return_keys(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Return the keys as they are."""
+    """Return the random keys as they are: a copy of a key (JAX's `random_clone`) is the same key."""
     return inputs
 
 
@@ -191,7 +200,7 @@ def write_hash_function() -> str:
     lines: list[str] = []
 
     def op(text: str) -> str:
-        """Append an operation; return the new name of its result."""
+        """Append an instruction, given without its result; return the new name of its result."""
         lines.append(f"  %t{len(lines)} = {text}")
         return f"%t{len(lines) - 1}"
 

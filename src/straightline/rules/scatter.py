@@ -57,12 +57,12 @@ def _make_scatter_rule(op: str | None) -> Rule:
 
 
 def _clips_indices(equation: JaxprEqn) -> bool:
-    """Return whether windows beyond the array are moved into it, where other modes drop them."""
+    """Return whether a scatter moves windows that reach beyond the array into it; in other modes it drops them."""
     return bool(equation.params["mode"] == GatherScatterMode.CLIP)
 
 
 def _combine_entry(graph: Graph, op: str | None, old: Any, new: Any) -> Any:
-    """Return `old op new`, or `new` in place of the old number where there is no operation."""
+    """Return the node of `old op new`, such as a sum; where `op` is None, `new` replaces the old number."""
     return new if op is None else graph.node(op, new.type, old, new)
 
 

@@ -27,7 +27,7 @@ def _make_rearranging_rule(function: Callable[[np.ndarray, Any, tuple[int, ...]]
 
 
 def _broadcast_in_dim(x: np.ndarray, params: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """Return an array broadcast to a shape; the array's axis k becomes axis broadcast_dimensions[k] of the result."""
+    """Return an array of nodes broadcast to a shape: its axis k becomes axis broadcast_dimensions[k] of the result."""
     placed = [1] * len(shape)
     for size, axis in zip(x.shape, params["broadcast_dimensions"], strict=True):
         placed[axis] = size
@@ -35,35 +35,39 @@ def _broadcast_in_dim(x: np.ndarray, params: Any, shape: tuple[int, ...]) -> np.
 
 
 def _slice(x: np.ndarray, params: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """Return entries from start to limit along each axis, by steps."""
+    """Return the entries of JAX's `slice`: along each axis from its start up to its limit, by its step."""
     steps = params["strides"] or (1,) * x.ndim
     return x[tuple(map(slice, params["start_indices"], params["limit_indices"], steps))]
 
 
 def _split(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Return an array's parts along an axis."""
+    """Return the parts of an array (of nodes) along the operation's axis, of the operation's sizes."""
     ends = np.cumsum(equation.params["sizes"])[:-1]
     return np.split(inputs[0], ends, axis=equation.params["axis"])
 
 
 def _concatenate(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Return arrays one after another along an axis."""
+    """Return arrays (of nodes) one after another along the operation's axis, as one array."""
     return [np.concatenate(inputs, axis=equation.params["dimension"])]
 
 
 def _stack(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Return arrays along a new axis."""
+    """Return arrays (of nodes) of one shape stacked along a new axis."""
     return [np.stack(inputs, axis=equation.params["axis"])]
 
 
 def _unstack(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Return an array's entries along an axis."""
+    """Return an array (of nodes) as its parts along the operation's axis, one for each index, without that axis."""
     rows = np.moveaxis(inputs[0], equation.params["axis"], 0)
     return [rows[i : i + 1].reshape(rows.shape[1:]) for i in range(len(rows))]
 
 
 def _lower_pad(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Lower `pad`: return x surrounded by a filling; negative padding cuts entries of x off."""
+    """Return x surrounded by a filling, as JAX's `pad` does; negative padding cuts entries of x off.
+
+    x is an array of nodes (the program's scalar operations), and the filling is one node. `padding_config` has for each
+    axis how many entries come before and after x, and how many between two neighbours.
+    """
     x, filling = inputs
     padded = np.empty(result_shape(equation), dtype=object)
     padded[...] = filling[()]
@@ -88,7 +92,7 @@ def _iota(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> l
 
 
 def _make_empty_array(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[Any]:
-    """Return the memory that a loop fills, as the transpose of a scan begins with: zeros."""
+    """Return an array of zeros for JAX's `empty`, whose entries may be anything: a loop will fill them."""
     return [lowering.make_known_array(np.zeros(result_shape(equation), equation.params["dtype"]))]
 
 

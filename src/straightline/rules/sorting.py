@@ -11,7 +11,11 @@ from straightline.size_limits import FEW
 
 
 def _sort(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """Sort along an axis by the first array, and what comes with it; equal numbers keep their order, NaN is last."""
+    """Return arrays sorted along an axis by the first one (JAX's `sort`); equal numbers keep their order, NaN is last.
+
+    Data decide the order, so that nothing can be moved when the program is written. It is written as exchanges of
+    neighbours at fixed places instead, by selections: as many passes as there are entries, at most FEW.
+    """
     axis, graph = equation.params["dimension"], lowering.graph
     count, kind = inputs[0].shape[axis], type_of(equation.invars[0].aval)
     if equation.params["num_keys"] != 1 or kind == "bool" or count > FEW:

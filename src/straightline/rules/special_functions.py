@@ -108,8 +108,9 @@ def _evaluate_upper_fraction(a: jax.Array, x: jax.Array, serves: jax.Array) -> j
         last number of the state is |c d - 1|.
         """
         n, c, d, fraction, _ = state
-        numerator, b = n * (a - n), x + 2 * n + 1 - a
-        c, d = b + numerator / c, 1 / _replace_zero_by_tiny(b + numerator * d)
+        numerator, denominator = n * (a - n), x + 2 * n + 1 - a
+        c = denominator + numerator / c
+        d = 1 / _replace_zero_by_tiny(denominator + numerator * d)
         return ContinuedFraction(n + 1, _replace_zero_by_tiny(c), d, fraction * c * d, jnp.abs(c * d - 1))
 
     def still_changes(state: ContinuedFraction) -> jax.Array:
@@ -182,7 +183,7 @@ def expand_coefficients() -> list[list[float]]:
 
 
 def _replace_zero_by_tiny(x: jax.Array) -> jax.Array:
-    """Return x, a tiny number for zero."""
+    """Return x, with TINY in the place of 0, since Lentz's method divides by it: the next quotient makes up for it."""
     return jnp.where(x == 0, TINY, x)
 
 
@@ -251,9 +252,13 @@ def digamma(x: jax.Array) -> jax.Array:
 
 
 def _lower_igamma(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """Return P(a, x) of `igamma`, or Q(a, x) of `igammac`."""
-    below, above = _inline_in_double(regularised_incomplete_gammas, lowering, equation, inputs)
-    return [above if equation.primitive.name == "igammac" else below]
+    """Return P(a, x) for JAX's operation `igamma`, or Q(a, x) = 1 - P(a, x) for `igammac`, entry by entry.
+
+    P is the mass below x of the gamma law of shape a. `inputs` are the arrays a and x; the function that computes P and
+    Q, written with JAX, is lowered: added as scalar operations to the program that is being written (`lowering`).
+    """
+    p, q = _inline_in_double(regularised_incomplete_gammas, lowering, equation, inputs)
+    return [q if equation.primitive.name == "igammac" else p]
 
 
 def _inline_in_double(
@@ -272,14 +277,17 @@ def _inline_in_double(
 
 
 def _convert(lowering: Lowering, type: Type, value: Value) -> Value:
-    """Return an array's numbers in another type."""
+    """Return an array as nodes (scalar operations) that convert each of its numbers to another type."""
     nodes = lowering.nodes(value)
     return arrange_nodes((lowering.graph.node("convert", type, n) for n in nodes.ravel().tolist()), nodes.shape)
 
 
 @cache
 def _trace_over_arrays(function: Callable[..., Any], count: int, shape: tuple[int, ...]) -> ClosedJaxpr:
-    """Return the program that applies a function of `count` scalars to each entry of `count` arrays, in double."""
+    """Return the program that applies a function of `count` scalars to each entry of `count` arrays of this shape.
+
+    JAX traces it in double precision, by `vmap` over each axis; it is traced once for each shape.
+    """
     over_arrays = function
     for _ in shape:
         over_arrays = jax.vmap(over_arrays)

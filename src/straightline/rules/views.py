@@ -27,7 +27,7 @@ def _make_view_rule(name: str, view: View) -> Rule:
     """
 
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-        """Return the `view` of an array in memory, or if there is none, nodes by the operation's rule `name`."""
+        """Return the view of an array in memory; if there is none, its numbers, loaded as nodes and rearranged."""
         array_view = view(inputs[0], equation.params, result_shape(equation))
         if array_view is not None:
             return [array_view]
@@ -44,7 +44,7 @@ def _slice(x: StridedArray, params: Any, shape: tuple[int, ...]) -> StridedArray
 
 
 def _reverse(x: StridedArray, params: Any, shape: tuple[int, ...]) -> StridedArray:
-    """Return the view of an array in memory that goes backwards along some axes."""
+    """Return the view of an array in memory that goes backwards along the operation's axes; nothing is copied."""
     # Begin at the last entry of each such axis, and go by negative strides.
     axes = params["dimensions"]
     offset = sum(x.strides[a] * (x.shape[a] - 1) for a in axes)
@@ -52,12 +52,12 @@ def _reverse(x: StridedArray, params: Any, shape: tuple[int, ...]) -> StridedArr
 
 
 def _transpose(x: StridedArray, params: Any, shape: tuple[int, ...]) -> StridedArray:
-    """Return a view with the axes in another order."""
+    """Return the view of an array in memory with its axes in the order of the operation's `permutation`."""
     return x.view(shape, [x.strides[a] for a in params["permutation"]])
 
 
 def _reshape(x: StridedArray, params: Any, shape: tuple[int, ...]) -> StridedArray | None:
-    """Return a view of another shape; None if no strides describe it."""
+    """Return the view of an array in memory in another shape; None if no strides describe it."""
     return x.view_in_shape(shape)
 
 
@@ -188,13 +188,17 @@ def _view_window(
 
 
 def _match_strides(view: StridedArray, shape: tuple[int, ...]) -> list[int]:
-    """Return the strides of a view in a shape that differs from its own by axes of length 1 alone: theirs are 0."""
+    """Return the strides of a view in another shape, which differs only in axes of length 1; their strides are 0."""
     strides = iter([stride for length, stride in zip(view.shape, view.strides, strict=True) if length != 1])
     return [next(strides) if length != 1 else 0 for length in shape]
 
 
 def _concatenate(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """Concatenate along the first axis in new memory, along another axis row by row."""
+    """Return the concatenation of arrays along the operation's axis, in new memory.
+
+    Along the first axis the arrays are put one behind another; along another axis a loop joins them row by row. Short
+    results, and arrays of known numbers, are concatenated as nodes (scalar operations), without memory.
+    """
     shape, axis = result_shape(equation), equation.params["dimension"]
     # As nodes if the result is short, or if all that is in memory is known numbers, which stay known then.
     arrays_in_memory = [x for x in inputs if isinstance(x, StridedArray)]
@@ -214,14 +218,14 @@ def _concatenate(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
 
 
 def join_arrays(lowering: Lowering, parts: list[Value], shape: tuple[int, ...]) -> StridedArray:
-    """Return the concatenation of arrays along the first axis, in one buffer of this `shape`.
+    """Return the concatenation of arrays along the first axis, in one memory (buffer) of this `shape`.
 
-    An array that has a buffer of its own (`_is_whole_buffer`) is computed into its place directly. All others are
-    copied.
+    An array that is all of a buffer of its own is computed into its place directly: its buffer becomes a part of the
+    new one. All others are copied. At least one of the `parts` is in memory, and tells the type of the numbers.
     """
     graph = lowering.graph
-    type = next(x for x in parts if isinstance(x, StridedArray)).type
-    buffer, start = Buffer("scratch", type, shape, graph.current), 0
+    number_type = next(x for x in parts if isinstance(x, StridedArray)).type
+    buffer, start = Buffer("scratch", number_type, shape, graph.current), 0
     for x in parts:
         if isinstance(x, StridedArray) and _is_whole_buffer(x, graph.current):
             buffer.place_buffer_inside(x.buffer, start)
@@ -232,7 +236,7 @@ def join_arrays(lowering: Lowering, parts: list[Value], shape: tuple[int, ...]) 
 
 
 def _is_whole_buffer(x: StridedArray, block: Any) -> bool:
-    """Return whether an array is all of a buffer that this block fills and that lies inside no other buffer."""
+    """Return whether an array is all of a memory (buffer) that this block fills and that is no part of another."""
     buffer = x.buffer
     is_contiguous = not x.moves and x.offset == 0 and x.strides == contiguous_strides(x.shape)
     is_whole = is_contiguous and x.size == buffer.size
@@ -242,7 +246,8 @@ def _is_whole_buffer(x: StridedArray, block: Any) -> bool:
 def _copy_into(lowering: Lowering, x: Value, buffer: Buffer, start: int) -> None:
     """Store an array into a buffer, from index `start` on.
 
-    Up to TABLE entries, and arrays of nodes, are stored entry by entry. A longer array in memory is copied by a loop.
+    Up to TABLE entries, and arrays of nodes (scalar operations), are stored entry by entry. A longer array in memory is
+    copied by a loop.
     """
     graph = lowering.graph
     if x.size <= TABLE or not isinstance(x, StridedArray):

@@ -69,7 +69,10 @@ def write_elementary_functions(names: Iterable[str], width: int) -> str:
 
 
 def _write_by_number(name: str, kind: str, count: int, width: int) -> str:
-    """Return the LLVM text of a function of vectors that calls a C function of `count` arguments for each lane."""
+    """Return the LLVM text of a function of vectors that calls the C library's function `name` for each lane.
+
+    The function has `count` arguments of the type `kind`, "double" or "float"; a vector has `width` lanes.
+    """
     real = f"%{kind}"
     lines, results = [], "poison"  # `results` names the vector of results so far; "poison" has no number set
     for lane in range(width):

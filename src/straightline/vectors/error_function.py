@@ -91,7 +91,9 @@ def erfc(x: Vector) -> Vector:
     """
     size = abs(x)
     centre, middle, tail = _evaluate_ranges(size)
+    # Near 0, 1 - (x + x centre); above 1/4, where 1 - x rounds, written about 1/2.
     inner = select(x < 0.25, 1 - fma(x, centre, x), 0.5 - (x - 0.5 + x * centre))
+    # Further out, erfc x of positive x, and 2 - erfc(-x) of negative ones; from 28 or -6 on they are 0 and 2.
     positive = select(size < 1.25, (1 - AT_ONE) - middle, select(size >= 28.0, 0.0, tail))
     negative = select(size < 1.25, 1 + (AT_ONE + middle), 2 - tail)
     negative = select(size >= 6.0, 2.0, negative)
@@ -99,7 +101,10 @@ def erfc(x: Vector) -> Vector:
 
 
 def _evaluate_ranges(size: Vector) -> tuple[Vector, Vector, Vector]:
-    """Compute (erf x - x) / x near 0, erf x - AT_ONE near 1, erfc x beyond: each valid in its own range."""
+    """Return (erf x - x) / x, erf x - AT_ONE, and erfc x for numbers x >= 0 (`size`), each valid in its own range.
+
+    The first is valid below 0.84375, the second from there up to 1.25, and the third beyond.
+    """
     square = size * size
     centre = polynomial(square, CENTRE[0]) / polynomial(square, CENTRE[1])
     # Near 1 and beyond: one rational function whose coefficients and argument depend on where x is.

@@ -58,7 +58,7 @@ FORMATS = {
 
 
 def find_format(x: Vector) -> PrecisionFormat:
-    """Return the format of a vector's numbers."""
+    """Return the constants of the precision (double or float) of a vector's numbers."""
     return FORMATS[x.scalar]
 
 
@@ -171,18 +171,22 @@ def _reduce_argument(x: Vector, n: Vector) -> tuple[Vector, Vector]:
 
 
 def _power_of_two(form: PrecisionFormat, n: Vector) -> Vector:
-    """Return 2^n of integers -1022 ... 1023, of floats -126 ... 127."""
+    """Return 2^n of integers n, -1022 to 1023 for doubles and -126 to 127 for floats, made from its bits.
+
+    The bits of a real number are its exponent above those of the fraction, so that those of 2^n are those of 1 plus n
+    shifted by the length of the fraction.
+    """
     return ((n << form.fraction) + form.one_bits).as_type("double" if form.word == "i64" else "float")
 
 
 def _scale_by_power_of_two(x: Vector, n: Vector) -> Vector:
-    """Return x 2^n in two factors, each of which is a normal number."""
+    """Return x 2^n, multiplied in two steps, since 2^n alone may be beyond the range of normal numbers."""
     form, half = find_format(x), n >> 1
     return x * _power_of_two(form, half) * _power_of_two(form, n - half)
 
 
 def _limit_result(x: Vector, value: Vector, largest: float, smallest: float) -> Vector:
-    """Return the result; infinity for x beyond the largest, 0 below the smallest, NaN of NaN."""
+    """Return `value` with infinity where x is above `largest` and 0 where it is below `smallest`; NaN stays NaN."""
     return select(x > largest, math.inf, select(x < smallest, 0.0, value))
 
 
@@ -218,6 +222,6 @@ def _log(k: Vector, f: Vector, low: Vector | float) -> Vector:
 
 
 def _set_log_outside_domain(x: Vector, value: Vector) -> Vector:
-    """Return a logarithm's result; -infinity of 0, NaN below, infinity of infinity."""
+    """Return the logarithm `value` of x with -infinity where x is 0, NaN below, and infinity where x is infinite."""
     special = select(x.equals(0.0), -math.inf, select(x > 0.0, x, math.nan))
     return select((x > 0.0) & (x < math.inf), value, special)

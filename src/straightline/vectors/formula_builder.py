@@ -16,7 +16,10 @@ REALS = ("double", "float")
 
 @dataclass
 class FormulaBody:
-    """Operations of one function on vectors, of as many numbers as the text that it stands in says."""
+    """Operations of one LLVM function on vectors, of as many numbers as the text that it stands in says.
+
+    `lines` are the operations so far, and `block` is the label of the basic block that is being written.
+    """
 
     lines: list[str] = field(default_factory=list)
     block: str = "entry"
@@ -26,7 +29,7 @@ class FormulaBody:
         return f"%{scalar}"
 
     def add(self, scalar: str, operation: str) -> "Vector":
-        """Append an operation in LLVM's text; return its result, a vector of the type `scalar`."""
+        """Append an LLVM instruction, given without its result; return the result, a vector of numbers `scalar`."""
         name = f"%t{len(self.lines)}"
         self.lines.append(f"{name} = {operation}")
         return Vector(self, scalar, name)
@@ -74,7 +77,7 @@ def _make_operator(
 
 
 def _make_comparison(real_condition: str, integer_condition: str) -> Callable[["Vector", Operand], "Vector"]:
-    """Return a method that compares vectors, such as __lt__; reals and integers have different LLVM conditions."""
+    """Return a method that compares vectors, such as __lt__, by LLVM's condition for reals or that for integers."""
 
     def compare(self: "Vector", other: Operand) -> "Vector":
         """Write the comparison of self with other; return its truth values, lane by lane."""
@@ -94,7 +97,7 @@ class Vector:
 
     @property
     def type(self) -> str:
-        """Return the vector's type in LLVM."""
+        """Return the name of the vector's type in LLVM's text, such as "%double"."""
         return self.body.type(self.scalar)
 
     def like(self, value: Operand) -> "Vector":
@@ -112,23 +115,25 @@ class Vector:
     equals = _make_comparison("oeq", "eq")  # false for NaN
 
     def __neg__(self) -> "Vector":
+        """Write the negation of real numbers; return its result."""
         return self.body.add(self.scalar, f"fneg {self.type} {self.name}")
 
     def __abs__(self) -> "Vector":
+        """Write the absolute value of real numbers; return its result."""
         return self.body.call("fabs", self)
 
     def as_type(self, scalar: str) -> "Vector":
-        """Reinterpret the bits as another type."""
+        """Return the vector of scalars of another type, such as "i64", that have the same bits."""
         return self.body.add(scalar, f"bitcast {self.type} {self.name} to {self.body.type(scalar)}")
 
     def converted(self, scalar: str) -> "Vector":
-        """Return the nearest real numbers of another precision."""
+        """Return the nearest real numbers of another precision, `scalar` "double" or "float"."""
         how = "fpext" if scalar == "double" else "fptrunc"
         return self.body.add(scalar, f"{how} {self.type} {self.name} to {self.body.type(scalar)}")
 
 
 def rounded(value: float) -> float:
-    """Return the nearest number of single precision."""
+    """Return the number of single precision that is nearest to a number."""
     nearest: float = struct.unpack("f", struct.pack("f", value))[0]
     return nearest
 
@@ -158,23 +163,23 @@ def select(condition: Vector, yes: Operand, no: Operand) -> Vector:
 
 
 def fma(a: Operand, b: Operand, c: Operand) -> Vector:
-    """Compute a b + c, rounded once; one of them is a vector."""
-    model = next(v for v in (a, b, c) if isinstance(v, Vector))
+    """Return a b + c, rounded once, lane by lane; at least one of them is a vector, and numbers stand for vectors."""
+    model = next(v for v in (a, b, c) if isinstance(v, Vector))  # whose type and text the numbers take
     return model.body.call("fma", *(model.like(v) for v in (a, b, c)))
 
 
 def sqrt(x: Vector) -> Vector:
-    """Compute the square root, correctly rounded."""
+    """Return the square root of each number of a vector, correctly rounded."""
     return x.body.call("sqrt", x)
 
 
 def copy_sign(magnitude: Vector, sign: Vector) -> Vector:
-    """Return |magnitude| with the sign of the other, also that of a zero."""
+    """Return |magnitude| with the sign of `sign` in each lane; a zero has a sign too."""
     return magnitude.body.call("copysign", magnitude, magnitude.like(sign))
 
 
 def polynomial(x: Vector, coefficients: Sequence[Operand]) -> Vector:
-    """Evaluate c_0 + c_1 x + c_2 x^2 + ... by Horner's rule."""
+    """Return c_0 + c_1 x + c_2 x^2 + ... by Horner's rule, for each number x of a vector; c_0 is the first."""
     *lower, value = coefficients
     for c in reversed(lower):
         value = fma(x, value, c)

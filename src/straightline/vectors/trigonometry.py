@@ -51,32 +51,40 @@ TURNS = [
 
 
 def sin(x: Vector) -> Vector:
-    """Return the sine of x = n pi / 2 + r, where |r| <= pi / 4; `quarter` is n.
+    """Return the sine of each number x of a vector, where x = n pi / 2 + r + r_low with an integer n, |r| <= pi / 4.
 
-    It is sin r for even n and cos r for odd n. It is negated if n mod 4 is 2 or 3. The sine of a small x is x itself,
-    and that of a very large x is computed by the C library.
+    The rest is the sum of r and r_low, what rounding takes from r. The sine is that of the rest for even n and its
+    cosine for odd n, negated if n mod 4 is 2 or 3. The sine of a small x is x itself, and that of a very large x is
+    computed by the C library. `select(condition, a, b)` takes a in the lanes where the condition holds, else b.
     """
-    quarter, r, low = _reduce_to_quarter(x)
-    value = select((quarter & 1).equals(0), _sin(r, low), _cos(r, low))
-    value = select((quarter & 2).equals(0), value, -value)
+    n, r, r_low = _reduce_to_quarter(x)
+    is_even = (n & 1).equals(0)
+    value = select(is_even, _sin(r, r_low), _cos(r, r_low))
+    is_in_first_half_turn = (n & 2).equals(0)
+    value = select(is_in_first_half_turn, value, -value)
     small = 2.0 ** -(27 if x.scalar == "double" else 13)
     return _use_library_where_large(x, select(abs(x) < small, x, value), "sin")
 
 
 def cos(x: Vector) -> Vector:
-    """Return the cosine of x = n pi / 2 + r, where |r| <= pi / 4; `quarter` is n.
+    """Return the cosine of each number x of a vector, where x = n pi / 2 + r + r_low with an integer n, |r| <= pi / 4.
 
-    It is cos r for even n and sin r for odd n. It is negated if n mod 4 is 1 or 2. The cosine of a very large x is
-    computed by the C library.
+    The rest is the sum of r and r_low, what rounding takes from r. The cosine is that of the rest for even n and its
+    sine for odd n, negated if n mod 4 is 1 or 2. The cosine of a very large x is computed by the C library.
+    `select(condition, a, b)` takes a in the lanes where the condition holds, else b.
     """
-    quarter, r, low = _reduce_to_quarter(x)
-    value = select((quarter & 1).equals(0), _cos(r, low), _sin(r, low))
-    value = select(((quarter + 1) & 2).equals(0), value, -value)
+    n, r, r_low = _reduce_to_quarter(x)
+    is_even = (n & 1).equals(0)
+    value = select(is_even, _cos(r, r_low), _sin(r, r_low))
+    is_not_negated = ((n + 1) & 2).equals(0)
+    value = select(is_not_negated, value, -value)
     return _use_library_where_large(x, value, "cos")
 
 
 def _reduce_to_quarter(x: Vector) -> tuple[Vector, Vector, Vector]:
-    """Return the number n of quarter turns in x, and the rest x - n pi / 2 as a sum of two numbers.
+    """Return the number n of quarter turns in x as an integer, and the rest x - n pi / 2 as a sum of two numbers.
+
+    The second number of the sum is what rounding takes from the first.
 
     pi / 2 is a sum of three numbers (high, middle, low), which are subtracted one by one. The first difference,
     x - n high, is exact.
@@ -117,17 +125,20 @@ def _cos(x: Vector, low: Vector) -> Vector:
 
 
 def _select_coefficients(x: Vector, coefficients: list[float]) -> list[float]:
-    """Return the coefficients that count in a vector's precision."""
+    """Return the first coefficients of a polynomial, as many as count in the precision of the vector x."""
     return coefficients if x.scalar == "double" else coefficients[:TERMS_OF_FLOATS]
 
 
 def _use_library_where_large(x: Vector, value: Vector, name: str) -> Vector:
-    """Return the value where |x| is small enough for it, else that of the scalar library, if a lane needs it."""
+    """Return `value` in the lanes where |x| < LARGEST, in the others the C library's function `name` of x.
+
+    The library is called only if some lane of the vector needs it.
+    """
     return x.body.compute_where_needed(abs(x) >= LARGEST[x.scalar], lambda: x.body.call(name, x), value)
 
 
 def atan(x: Vector) -> Vector:
-    """Return the arcus tangent: a known angle and that of (x - tan angle) / (1 + x tan angle)."""
+    """Return the arc tangent of each number of a vector: that of |x|, with the sign of x."""
     return copy_sign(_atan_of_positive(abs(x)), x)
 
 
@@ -174,5 +185,5 @@ def atan2(y: Vector, x: Vector) -> Vector:
 
 
 def _is_number(x: Vector) -> Vector:
-    """Return where x is not NaN."""
+    """Return in which lanes x is not NaN: NaN does not equal itself."""
     return x.equals(x)

@@ -42,11 +42,12 @@ def angles_at(angles: object, size: int) -> Angles:
 def wrap_near(value: A, reference: Array, angles: Angles) -> A:
     """Return the angles (..., n) changed by full turns so that they lie within half a turn of `reference` (..., n).
 
-    Components that are not angles are unchanged.
+    `angles` has the indices of the components that are angles, in radians; all others are unchanged. So is an angle
+    where it or its reference is NaN, not known: a difference from NaN says no turns. Arrays may be of NumPy or JAX.
     """
     if not angles:
         return value
-    xp = library(value, reference)
+    xp = library(value, reference)  # numpy, or jax.numpy where a number is traced
     turns = xp.round((value - reference) / TURN)  # TURN: 2 pi
     is_angle = np.isin(np.arange(np.shape(value)[-1]), angles)
     unwrapped: A = xp.where(is_angle & ~xp.isnan(turns), value - TURN * turns, value)
@@ -65,7 +66,7 @@ def continue_angles(
 
     f(x) is taken near f(center) + D (x - center). D is the Jacobian of resulting angles by given angles, rounded to
     whole turns. An angle that follows a given angle thus makes any number of turns with it, and every other angle is
-    taken within half a turn of its value at the center. `given`: indices of angles in x. `angles`: places of angles in
+    taken within half a turn of its value at the center. `given`: indices of angles in x. `angles`: indices of angles in
     f(x).
     """
     if not angles:
@@ -90,6 +91,9 @@ def find_wraps(values: Array, most: float) -> np.ndarray:
 
 
 def insert_gaps(time: Array, rows: np.ndarray, *parts: Array) -> tuple[np.ndarray, ...]:
-    """Return times and what is drawn over them, each (time,), with a NaN before these rows, which breaks the curve."""
+    """Return times and what is drawn over them, each (time,), with a NaN before each of `rows`, so that a curve breaks.
+
+    The time of such an entry is that of its row.
+    """
     time = np.asarray(time)
     return np.insert(time, rows, time[rows]), *(np.insert(np.asarray(part), rows, np.nan) for part in parts)

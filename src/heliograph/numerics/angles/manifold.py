@@ -63,9 +63,10 @@ class Manifold(NamedTuple):
         return wrap_near(x, reference, self.angles)
 
     def chart(self, function: Callable[[jax.Array], jax.Array], center: jax.Array) -> Callable[[jax.Array], jax.Array]:
-        """Return the function x -> function(center plus (x - center)) of plain differences from `center`.
+        """Return the function x -> function(center plus (x - center)), where x - center is a difference of vectors.
 
-        `plus` adds vectors and turns attitudes. The derivative at x = center is then that by the change of the state.
+        `plus` adds vectors and turns attitudes. So the derivative at x = center, as JAX takes it, is the derivative by
+        a small change of the state, as an extended filter needs it. Without attitudes it is the function itself.
         """
         if not self.rotations:
             return function
@@ -89,21 +90,28 @@ class Manifold(NamedTuple):
         return lambda x: self.unsettle(m, function_of_vectors(x))
 
     def settle(self, center: Array, x: Array) -> Any:
-        """Return center plus (x - center), (..., n): x with vectors of rotation from `center` replaced by attitudes.
+        """Return center plus (x - center), (..., n): the states of vectors x as `chart_move` computes with them.
 
-        Angles stay as they are.
+        In x, an attitude is center + r, with the rotation vector r from `center`; here it becomes the attitude that r
+        leads to. All other components, angles too, stay as they are.
         """
         return self._replace_rotations(x, turn, center, x - center) if self.rotations else x
 
     def unsettle(self, center: Array, x: Array) -> Any:
-        """Return center + (x difference center), (..., n), the inverse of `settle`; angles stay as they are."""
+        """Return center + (x difference center), (..., n), the inverse of `settle`.
+
+        An attitude of x becomes center + r, with the rotation vector r from `center` to it, so that transforms of
+        vectors can compute with it. All other components, angles too, stay as they are.
+        """
         return self._replace_rotations(x, lambda r, other: other + turn_between(r, other), x, center)
 
     def reset_jacobian(self, change: jax.Array) -> jax.Array | None:
-        """Return d((x + d) difference x')/dd at d = change with x' = x plus change (n, n), or None without rotations.
+        """Return the matrix J (n, n) that maps errors about a state x to errors about x' = x plus `change`.
 
-        It turns errors about x into errors about x'. It is the identity except for attitudes, where the block of a
-        rotation is the right Jacobian. `plus` and `difference` turn attitudes; + is that of vectors.
+        A filter finds the change with an error d, whose covariance is P, and moves its estimate from x to x'. The error
+        d' about x' is of the same state: x plus (change + d) = x' plus d'. So its covariance is J P J' with J = dd'/dd
+        at d = 0. J is the identity but for attitudes, for which `plus` turns: there d' is the turn from `change` to
+        change + d. None is returned if no state is an attitude.
         """
         if not self.rotations:
             return None
@@ -111,6 +119,7 @@ class Manifold(NamedTuple):
         for i in range(0, len(self.rotations), 3):
             columns = np.array(self.rotations[i : i + 3])  # of one rotation vector
             rotation = change[columns]
-            block = jax.jacfwd(lambda d, rotation=rotation: turn_between(d, rotation))(rotation)
+            # Derivative by r of the turn from `rotation` to r, at r = rotation (3, 3).
+            block = jax.jacfwd(lambda r, rotation=rotation: turn_between(r, rotation))(rotation)
             matrix = matrix.at[columns[:, None], columns].set(block)
         return matrix

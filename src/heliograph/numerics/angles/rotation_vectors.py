@@ -20,12 +20,12 @@ SMALL = 1e-4  # of a square: below it four terms of a series are exact to the la
 
 
 def _library(*values: object) -> Any:
-    """Return jax.numpy where one is of JAX."""
+    """Return jax.numpy if one of the arrays is JAX's, else numpy."""
     return jnp if any(isinstance(value, jax.Array) for value in values) else np
 
 
 def _entries_of(q: Array) -> tuple[Any, Any, Any, Any]:
-    """Return w, x, y and z (...) of quaternions (..., 4), of the library that they are of."""
+    """Return the entries w, x, y and z, each (...), of quaternions (..., 4)."""
     return q[..., 0], q[..., 1], q[..., 2], q[..., 3]
 
 
@@ -78,7 +78,7 @@ def multiply_quaternions(q: Array, p: Array) -> Any:
 
 
 def turn(r: Array, by: Array) -> Any:
-    """Return r plus a turn in its own axes, log(exp(r) exp(by)): rotation vectors (..., 3)."""
+    """Return attitudes r after a turn `by` in their own (body) axes, log(exp(r) exp(by)): rotation vectors (..., 3)."""
     return rotation_vector_of(multiply_quaternions(quaternion_of(r), quaternion_of(by)))
 
 

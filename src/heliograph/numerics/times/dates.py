@@ -116,7 +116,13 @@ def _match_date(text: str) -> tuple[re.Match[str], bool]:
 
 
 def _convert_to_nanoseconds(match: re.Match[str], leap: bool) -> int:
-    """Return the nanoseconds since 1970 in UTC; raise ValueError before FIRST and after LAST."""
+    """Return the nanoseconds since 1970 in UTC of a date whose parts DATE matched.
+
+    `leap`: whether it is the leap second after the second that was matched.
+
+    Raises:
+        ValueError: a date that does not exist or is not from FIRST to LAST; a leap second that ends no month.
+    """
     # The whole seconds first, since those of a zone may lead into or out of what nanoseconds can say.
     local, _, fraction = _format_local(match).partition(".")
     seconds, zone = int(np.datetime64(local, "s").astype(np.int64)), _format_offset(match["zone"])
@@ -143,7 +149,7 @@ def _format_local(match: re.Match[str]) -> str:
 
 
 def _format_offset(zone: str | None) -> str:
-    """Return the zone of a date as an offset, Z for UTC and for none."""
+    """Return the zone of a date as an offset such as +01:00; "Z" for UTC, and for a date without a zone."""
     return "Z" if zone in (None, "Z", "UTC", "GMT") else str(zone).removeprefix("Z")
 
 

@@ -78,7 +78,7 @@ def read_dates(name: str, value: object) -> np.ndarray | None:
     """
     if is_traced(value):
         return None
-    if getattr(getattr(value, "dtype", None), "kind", "") == "M":
+    if getattr(getattr(value, "dtype", None), "kind", "") == "M":  # datetime64, or a type of pandas with a zone
         filled = fill_masked(value) if isinstance(value, np.ma.MaskedArray) else value
         dates = np.asarray(filled)
         return _convert_to_nanoseconds(name, dates if dates.dtype.kind == "M" else np.asarray(filled, NANOSECONDS))
@@ -212,6 +212,6 @@ def describe_clock_set_forward(clock: np.ndarray, row: int) -> str:
 
 
 def backwards_text(clock: np.ndarray, row: int) -> str:
-    """Return the two times of that row and the row above in words."""
+    """Return the time of a row and that of the row before it in words: "3 after 5"."""
     now, before = (f"{t:.10g}" if clock.dtype.kind == "f" else str(t) for t in (clock[row], clock[row - 1]))
     return f"{now} after {before}"

@@ -58,13 +58,17 @@ def find_clock_set_back(time: np.ndarray) -> int | None:
     if time.dtype.kind != "M" or not forward.size:
         return None
     step, hour = float(np.median(forward)), 3600.0 * SECOND
-    if step > hour or np.count_nonzero(steps <= 0) > 2 * (1 + np.ptp(nanoseconds) // YEAR):
+    most_set_back = 2 * (1 + np.ptp(nanoseconds) // YEAR)
+    if step > hour or np.count_nonzero(steps <= 0) > most_set_back:
         return None  # the rows are in no order at all, or share their times
-    rows = 1 + np.flatnonzero((steps <= 0) & (np.abs(-steps - (hour - step)) <= step / 2))
+    # Rows whose time is back by an hour less a step, give or take half a step: 0 if the step is an hour.
+    is_back_by_an_hour = (steps <= 0) & (np.abs(-steps - (hour - step)) <= step / 2)
+    rows = 1 + np.flatnonzero(is_back_by_an_hour)
     is_sunday, month, day = _read_calendar(time[rows])
-    is_early = time[rows] - time[rows].astype("datetime64[D]") < np.timedelta64(3, "h")
+    is_before_three = time[rows] - time[rows].astype("datetime64[D]") < np.timedelta64(3, "h")
     ends_summer_time = ((month == 10) & (day > 24)) | (np.isin(month, (4, 11)) & (day < 8))
-    found = rows[is_sunday & is_early & ((steps[rows - 1] < 0) | ends_summer_time)]
+    goes_back = steps[rows - 1] < 0  # where the time is the same, the day must be one on which summer time ends
+    found = rows[is_sunday & is_before_three & (goes_back | ends_summer_time)]
     return int(found[0]) if len(found) else None
 
 
@@ -86,14 +90,17 @@ def find_clock_set_forward(time: np.ndarray) -> int | None:
     if not forward.size:
         return None
     step, hour = float(np.median(forward)), 3600 * SECOND
-    rows = 1 + np.flatnonzero((np.abs(steps - (hour + step)) <= step / 2) & (step <= hour))
+    # Rows that come a step and an hour after the row before them, give or take half a step.
+    skips_an_hour = (np.abs(steps - (hour + step)) <= step / 2) & (step <= hour)
+    rows = 1 + np.flatnonzero(skips_an_hour)
     is_sunday, month, day = _read_calendar(time[rows])
     begins_summer_time = (month == 3) & ((day > 24) | ((day > 7) & (day < 15)))
     begins_summer_time |= ((month == 9) & (day > 23)) | ((month == 10) & (day < 8))
+    # Times of the day of the row before and of the row: all of the hour from h to h + 1 lies between them.
     midnight = time[rows].astype("datetime64[D]").astype("datetime64[ns]").astype(np.int64)
-    last, next_ = nanoseconds[rows - 1] - midnight, nanoseconds[rows] - midnight
-    is_hour_missing = np.any([(last < h * hour) & (next_ >= (h + 1) * hour) & (last >= 0) for h in (1, 2, 3)], axis=0)
-    found = rows[is_sunday & begins_summer_time & is_hour_missing]
+    before, after = nanoseconds[rows - 1] - midnight, nanoseconds[rows] - midnight
+    is_hour_missing = [(before >= 0) & (before < h * hour) & (after >= (h + 1) * hour) for h in (1, 2, 3)]
+    found = rows[is_sunday & begins_summer_time & np.any(is_hour_missing, axis=0)]
     return int(found[0]) if len(found) else None
 
 

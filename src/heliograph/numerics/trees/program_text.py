@@ -28,9 +28,10 @@ def hash_numbers(numbers: PyTree) -> str:
 
 
 def write_program_text(program: ClosedJaxpr) -> str:
-    """Return operations, parameters and constants, a line for each operation; inner programs by their hash.
+    """Return a program that JAX traced as text: its constants and a line for each operation, inner programs by hashes.
 
-    A lowered program says the same, and takes as long to write as half of the trace.
+    The same function gives the same text in each process, so that a compiled program is found again by it. JAX's own
+    text of the lowered program says the same, but takes half as long to write as the trace.
     """
     return _ProgramWriter().write_program(program.jaxpr, program.consts)
 
@@ -71,7 +72,10 @@ class _ProgramWriter:
         return " ".join(self._write_value(x.val) if isinstance(x, Literal) else str(numbers[x]) for x in atoms)
 
     def _write_value(self, value: Any) -> str:
-        """Return the text of a parameter of an operation: arrays and inner programs by their hashes."""
+        """Return the text of a parameter of an operation, the same in each process.
+
+        Arrays and inner programs are written as their hashes, a dictionary by sorted keys, functions and types by name.
+        """
         match value:
             case ClosedJaxpr():
                 return self._write_hash(value, value.jaxpr, value.consts)

@@ -20,7 +20,7 @@ class Static(NamedTuple):
     parts: tuple[Hashable, ...]
 
     def with_arrays(self, numbers: Sequence[jax.Array]) -> PyTree:
-        """Return the object with these arrays."""
+        """Return the object with these arrays in the places of its own, in the order of its leaves."""
         rest = iter(numbers)
         return self.tree.unflatten([next(rest) if leaf is None else leaf for leaf in self.parts])
 
