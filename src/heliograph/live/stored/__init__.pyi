@@ -21,3 +21,4 @@ from .snapshot import list_versions as list_versions
 from .snapshot import network_identity as network_identity
 from .snapshot import pack_snapshot as pack_snapshot
 from .snapshot import unpack_snapshot as unpack_snapshot
+from .timeline_migration import carry_over_timeline as carry_over_timeline
