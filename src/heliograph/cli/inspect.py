@@ -19,7 +19,7 @@ def inspect(
         str, Parameter(help="Its nodes and inputs are listed: my_network.py, or my_network.py:name.")
     ] = "",
     dbc: Annotated[Path | None, Parameter(help="Database of the bus of a log of CAN: car.dbc.")] = None,
-    channel: Annotated[str, Parameter(help="Bus of a log of several: 1, or can0.")] = "",
+    channel: Annotated[int | str | None, Parameter(help="Bus of a log of several: 1, or can0.")] = None,
     seconds: Annotated[float, Parameter(help="How long to listen to a broker.")] = 10.0,
 ) -> None:
     """List the topics of a bag, a file or a broker: rates, gaps, lateness, and `sources` to paste into a network.
@@ -45,9 +45,7 @@ def inspect(
         loaded = load_network(network)
         names = {name: node.received_names for name, node in loaded.nodes.items()} | {"inputs": loaded.inputs}
     # The table of topics, the sources that are suggested for them, and what could not be read.
-    topics, broken = _collect_topics(
-        recording, seconds, LogSources({}, dbc=dbc, channel=int(channel) if channel.isdigit() else channel or None)
-    )
+    topics, broken = _collect_topics(recording, seconds, LogSources({}, dbc=dbc, channel=channel))
     _print_table(topics)
     if topics:
         print(suggest_sources(topics, names))
