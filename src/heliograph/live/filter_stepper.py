@@ -6,7 +6,7 @@ leaves implausible measurements out and goes on, and takes many rows at once.
 
 from collections.abc import Sequence
 from functools import cached_property, lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -30,8 +30,8 @@ from heliograph.numerics.trees.program_text import hash_numbers, write_program_t
 from heliograph.numerics.trees.tree_structure import Static, split_structure
 from heliograph.numerics.types import Float, PyTree
 from straightline import Unsupported, compile_one
-from straightline.compiled import SingleRunCode
 
+SingleRunCode: TypeAlias = Any  # what `straightline.compile_one` returns; its class is not public
 Leaves = list[np.ndarray]
 PARTS = len(Judgement._fields)
 RARE = 1e-4  # probability with which an honest filter sees what counts as unexpected
