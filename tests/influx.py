@@ -2,13 +2,14 @@
 
 import os
 import shutil
-import socket
 import subprocess
 import tempfile
 import time
 from http.client import HTTPConnection
 from pathlib import Path
 from urllib.parse import urlencode
+
+from heliograph_studies.live.server import free_port
 
 SECONDS = 60  # until a server that starts must answer
 CONFIGURATION = """
@@ -31,12 +32,6 @@ store-enabled = false
 def influxd() -> str | None:
     """The program, where it is on the path."""
     return shutil.which("influxd")
-
-
-def free_port() -> int:
-    with socket.socket() as listener:
-        listener.bind(("127.0.0.1", 0))
-        return int(listener.getsockname()[1])
 
 
 class Influx:

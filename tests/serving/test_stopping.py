@@ -3,7 +3,6 @@
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 import urllib.error
@@ -11,6 +10,8 @@ import urllib.request
 from time import monotonic, sleep
 
 import pytest
+
+from heliograph_studies.live.server import free_port
 
 pytestmark = pytest.mark.slow
 LONGEST = 10.0  # seconds from SIGTERM to the end
@@ -28,9 +29,7 @@ network = hg.Network(plant, {f"n{i}": node for i, node in enumerate(nodes)})
 def service(tmp_path):
     """A service of six event senders, whose programs take seconds to compile: its process, and the port of its page."""
     (tmp_path / "net.py").write_text(NETWORK)
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = free_port()
     command = [sys.executable, "-m", "heliograph", "serve", "net.py", "--store", "none", "--page", str(port)]
     environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path)}  # nothing is compiled yet
     process = subprocess.Popen(

@@ -14,6 +14,7 @@ pytest.importorskip("paho")
 
 from heliograph import cli
 from heliograph.serving import Output, Transport, make_transport, parse_address
+from heliograph_studies.live.server import free_port
 
 CONNECT, PUBLISH, DISCONNECT = 1, 3, 14  # kinds of packets of MQTT 3.1.1
 OUTPUTS = [Output(None, "", "provisional", b"now"), *(Output(i, "", "final", str(i).encode()) for i in range(3))]
@@ -109,9 +110,7 @@ def test_what_was_not_acknowledged_is_published_again_after_the_connection_ended
 @pytest.mark.skipif(which("mosquitto") is None, reason="no mosquitto here")
 def test_a_refused_login_is_told_as_one(tmp_path, capsys):
     """A broker that takes no anonymous client, and knows nobody."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = free_port()
     settings = tmp_path / "mosquitto.conf"
     settings.write_text(f"listener {port} 127.0.0.1\nallow_anonymous false\n")
     broker = subprocess.Popen(["mosquitto", "-c", str(settings)], stdout=-3, stderr=-3)
