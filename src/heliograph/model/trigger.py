@@ -16,6 +16,7 @@ from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int
 Reference = Literal["sent", "acknowledged", "prediction", "zero"]
 Region = Literal["box", "ball", "each"]
 Losses = Literal["unknown", "numbered", "known"]
+REFUSED = 2.0  # what is known of a value that came and is refused: behind z, in place of 1 for one that was lost
 
 
 @readable
@@ -46,8 +47,8 @@ class AbstractTrigger(Module):
     Args:
         region: "box" and "ball" transmit all of y or nothing, "each" decides for each component alone.
         losses: knowledge of the receiver of a transmission that was lost: "unknown", none; "numbered", from the
-            sequence number of the next value that arrives; "known", at once. It arrives behind z: the number of
-            transmissions lost since the last value (with a value), or whether one was lost now (0 or 1).
+            sequence number of the next value that arrives; "known", at once. It arrives behind z: how many were lost
+            since the last value (with a value), or if one was lost now (0 or 1; 2: it came, and is refused).
         reference: what y is compared with: the value "sent" or "acknowledged" last, a "prediction" of both
             ends, or "zero".
         heartbeat: most steps between two transmissions, (); None where there is no such limit.
@@ -78,8 +79,8 @@ class AbstractTrigger(Module):
     ) -> Float[np.ndarray, "*rows received"]:
         """Return what was received without the readings that are refused, although they were sent.
 
-        A message of which no value is left counts as lost where losses are "known". Where they are "numbered" its
-        number stays, without a value: it came. Where they are "unknown" it cannot be told from silence.
+        A message of which no value is left was sent all the same: where losses are "known", REFUSED stands behind z;
+        where they are "numbered", its number stays; where they are "unknown" it cannot be told from silence.
 
         Args:
             z: what was received, the numbers about losses last.
@@ -92,7 +93,7 @@ class AbstractTrigger(Module):
             came, stays = ~np.isnan(z[..., :count]), ~np.isnan(left[..., :count])
             if self.region != "each":  # all values are one message
                 came, stays = (np.asarray(mask.any(axis=-1, keepdims=True)) for mask in (came, stays))
-            left[..., count:] = np.where(came & ~stays, 1.0, left[..., count:])
+            left[..., count:] = np.where(came & ~stays, REFUSED, left[..., count:])
         return left
 
     def event(self, error: jax.Array, key: jax.Array, k: jax.Array) -> jax.Array:

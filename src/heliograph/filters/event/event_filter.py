@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from copy import copy
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -32,6 +31,7 @@ from heliograph.filters.event.joint_gaussian import (
     set_known_components,
 )
 from heliograph.filters.event.sender_status_probabilities import (
+    Message,
     SilenceByCause,
     agrees_with_number,
     append_losses,
@@ -54,19 +54,6 @@ from heliograph.numerics.types import Array, ArrayLike, Float
 
 RIM = 1e-9  # share of delta by which a value may lie inside for rounding
 COUNTED = 16  # counts 0 to 15 of lost transmissions; the last one stands for all larger ones
-
-
-class Message(NamedTuple):
-    """What came from a sender at a step.
-
-    sender: its number; value: what arrived, all NaN in silence; losses: how many it reports (1 or 0 where only the last
-    one is known), NaN if it reports none; has_sent: it has a reference to compare its signal with.
-    """
-
-    sender: int
-    value: jax.Array
-    losses: jax.Array
-    has_sent: jax.Array
 
 
 class EventFilter(AbstractSizedFilter):
@@ -197,16 +184,17 @@ class EventFilter(AbstractSizedFilter):
         # Senders one after the other, each given those before it; each sends the entries `components` of y.
         for s, components in enumerate(self.senders):
             received = values[components] if len(self.senders) > 1 else values
-            message = Message(s, received, losses[s] if len(losses) else jnp.asarray(jnp.nan), has_sent[s])
+            losses_of_sender = losses[s] if len(losses) else jnp.asarray(jnp.nan)
+            message = Message.read(s, received, losses_of_sender, has_sent[s], self.trigger.losses)
             xry = augment_by_signal(plant, sensor, self.transform, mixture, start)  # joint Gaussians of (x, r, y)
             posterior, mean_of_value, covariance_of_value = self._condition_on_message(xry, message, channel)
             # Normalise the weights; their sum was p(value or silence of sender s | data before).
             log_likelihood_of_sender = log_total_weight(posterior.log_weight)
             log_likelihood += log_likelihood_of_sender
             mixture = posterior.scale_weights(-log_likelihood_of_sender)
-            # By now the sender has a reference, or once a value arrived if it waits for an acknowledgement.
-            arrived = jnp.any(~jnp.isnan(received))
-            has_sent = has_sent.at[s].set(has_sent[s] | (arrived if self.trigger.reference == "acknowledged" else True))
+            # By now the sender has a reference, or once a value came if it waits for an acknowledgement.
+            came = jnp.any(~jnp.isnan(received)) | message.is_refused
+            has_sent = has_sent.at[s].set(has_sent[s] | (came if self.trigger.reference == "acknowledged" else True))
             innovations.append(received - mean_of_value)
             covariances.append(covariance_of_value)
         innovation = Innovation(*append_losses(jnp.concatenate(innovations), covariances, losses), log_likelihood)
@@ -241,22 +229,24 @@ class EventFilter(AbstractSizedFilter):
         `xry`: K Gaussians of the state x, and the senders' references r and signals y; one sends if |y - r| > delta.
         """
         # Probabilities (K, M, A, C) of Gaussian, link mode, steps since sent and number of losses, for each cause.
-        s, losses = message.sender, message.losses
+        s = message.sender
         unsent, must_send = split_by_obligation(xry.status[:, s], message.has_sent, self.trigger.heartbeat)
         loss_probability = self._loss_probability(channel, s)[:, None, None]
-        by_cause = split_by_cause(unsent, must_send, loss_probability, losses, self.trigger.losses)
-        truncate = (
-            self._truncate_with_lost_references if self.reference_may_be_lost else self._truncate_with_known_reference
-        )
-        return restore_if_impossible(truncate(xry, s, by_cause), xry)
+        by_cause = split_by_cause(unsent, must_send, loss_probability, message, self.trigger.losses)
+        if self.reference_may_be_lost:
+            return restore_if_impossible(self._truncate_with_lost_references(xry, s, by_cause), xry)
+        return restore_if_impossible(self._truncate_with_known_reference(xry, message, by_cause), xry)
 
-    def _truncate_with_known_reference(self, xry: GaussianSum, s: int, by_cause: SilenceByCause) -> GaussianSum:
-        """Return the sum over (x, r) given silence of sender s, where its reference r is known.
+    def _truncate_with_known_reference(
+        self, xry: GaussianSum, message: Message, by_cause: SilenceByCause
+    ) -> GaussianSum:
+        """Return the sum over (x, r) given silence of a sender, where a value that is lost leaves its reference r.
 
         The sender sends y if |y - r| > delta. So each Gaussian of (x, r, y) is cut to the pieces of |y - r| <= delta
         and, if values may be lost, to those of |y - r| > delta. Gaussians in one piece are merged. `by_cause`:
         probabilities of each Gaussian's sender status with each cause of silence.
         """
+        s = message.sender
         sender, x_and_r = self.senders[s], np.arange(len(self.states) + self.outputs)
         # |y - r| <= delta: it was not sent, or it had to be sent nevertheless and was lost.
         inside = xry.with_sender_status(s, by_cause.unsent + by_cause.forced if self.may_lose else by_cause.unsent)
@@ -267,7 +257,11 @@ class EventFilter(AbstractSizedFilter):
             sent = xry.with_sender_status(s, by_cause.dropped + by_cause.forced)
             outside = self.region.truncate_outside(sent, sender, scale=1.0)
             pieces = concatenate_sums([pieces, merge_groups(outside, self.region.count_outside_parts(sender))])
-        return pieces.select_components(x_and_r)
+        kept = pieces.select_components(x_and_r)
+        # A value y that came was acknowledged, although the receiver refuses it: it is the new r.
+        renewed = pieces.select_components(self._find_new_reference(sender))
+        chosen: GaussianSum = jax.tree.map(lambda new, old: jnp.where(message.is_refused, new, old), renewed, kept)
+        return chosen if self.trigger.losses != "unknown" else kept
 
     def _truncate_with_lost_references(self, xry: GaussianSum, s: int, by_cause: SilenceByCause) -> GaussianSum:
         """Return the sum over (x, r) given silence of sender s, if a value y that was lost is its next reference r.

@@ -76,7 +76,8 @@ def event_filter(
     described, initial = _describe_channel(channel)
     steps = unstack(described)
     outputs = len(first(sensor).outputs)
-    may_lose = any(_may_lose_components(step) for step in steps)
+    # A value is lost by the link, or by its receiver, who refuses it: where losses are told, that is told too.
+    may_lose = trigger.losses != "unknown" or any(_may_lose_components(step) for step in steps)
     received = first(channel).outputs + trigger.side_information(outputs)
     fields_of_both: dict[str, Any] = {  # of the filter of a random trigger, and of that of a threshold
         "plant": plant, "sensor": sensor, "channel": described, "initial": initial, "transform": rule,

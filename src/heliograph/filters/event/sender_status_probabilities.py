@@ -8,8 +8,33 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from heliograph.model.trigger import Losses
+from heliograph.filters.event.gaussian_sum import FLOOR
+from heliograph.model.trigger import REFUSED, Losses
 from heliograph.numerics.types import Array, Int
+
+
+class Message(NamedTuple):
+    """What came from a sender at a step.
+
+    sender: its number; value: what arrived, all NaN in silence; losses: how many it reports (1 or 0 where only the last
+    one is known), NaN if it reports none; has_sent: it has a reference to compare its signal with; is_refused: a value
+    came, and was refused, so that it is NaN here.
+    """
+
+    sender: int
+    value: jax.Array
+    losses: jax.Array
+    has_sent: jax.Array
+    is_refused: jax.Array
+
+    @classmethod
+    def read(cls, sender: int, value: jax.Array, losses: jax.Array, has_sent: jax.Array, told: Losses) -> "Message":
+        """Return the message of a sender, of which a refused value shows in its number of losses.
+
+        Where losses are "known" (`told`), the number is REFUSED; where they are "numbered", it came without a value.
+        """
+        has_number = losses == REFUSED if told == "known" else ~jnp.isnan(losses)
+        return cls(sender, value, losses, has_sent, has_number & jnp.all(jnp.isnan(value)))
 
 
 class SilenceByCause(NamedTuple):
@@ -67,7 +92,7 @@ def status_after_sending(status: jax.Array, is_lost: bool) -> jax.Array:
 
 
 def split_by_cause(
-    unsent: jax.Array, must_send: jax.Array, loss_probability: jax.Array, losses: jax.Array, told: Losses
+    unsent: jax.Array, must_send: jax.Array, loss_probability: jax.Array, message: Message, told: Losses
 ) -> SilenceByCause:
     """Split probabilities of a sender's status (K, M, A, C), from which no value came, by the causes of its silence.
 
@@ -75,20 +100,29 @@ def split_by_cause(
         unsent: where the sender's rule decides whether it sends.
         must_send: where it must send.
         loss_probability: that what it sends is lost, for each mode (M, 1, 1).
-        losses: what is reported: where losses are known, 1 if its value was lost, 0 if not; where they are numbered,
-            how many were lost before a value that came and counts as not arrived; NaN where nothing is reported.
+        message: what came of it. Its losses, where they are known, are above 0 if its value was lost; where they are
+            numbered, how many were lost before a value that came and was refused.
         told: what is known of losses.
     """
-    dropped, forced = (status_after_sending(status * loss_probability, is_lost=True) for status in (unsent, must_send))
-    if told == "known":  # a reported loss says that y was sent, and no loss that it was not
-        unsent = jnp.where(losses > 0, 0.0, unsent)
-        dropped, forced = (jnp.where(losses > 0, status, 0.0) for status in (dropped, forced))
-    if told == "numbered":  # a number without a value says that y was sent, and came
-        arrival = (1.0 - loss_probability) * agrees_with_number(losses, unsent.shape[-1])
-        refused = [status_after_sending(status * arrival, is_lost=False) for status in (unsent, must_send)]
-        causes = zip((unsent, dropped, forced), (jnp.zeros_like(unsent), *refused), strict=True)
-        unsent, dropped, forced = (jnp.where(jnp.isnan(losses), silent, came) for silent, came in causes)
-    return SilenceByCause(unsent, dropped, forced)
+    # What is lost may be a value that the receiver refused without a word, also behind a link that loses nothing.
+    lost = loss_probability if told == "unknown" else jnp.maximum(loss_probability, FLOOR)
+    dropped, forced = (status_after_sending(status * lost, is_lost=True) for status in (unsent, must_send))
+    if told == "unknown":
+        return SilenceByCause(unsent, dropped, forced)
+    # A value that came and was refused: y was sent, and not lost.
+    losses, is_refused = message.losses, message.is_refused
+    came = 1.0 - loss_probability
+    if told == "numbered":
+        came = came * agrees_with_number(losses, unsent.shape[-1])
+    refused = [status_after_sending(status * came, is_lost=False) for status in (unsent, must_send)]
+    # No value and no word of a loss: where losses are known y was not sent, else it may be lost.
+    is_silent = ~(losses > 0) if told == "known" else ~is_refused
+    may_be_lost = losses > 0 if told == "known" else ~is_refused
+    return SilenceByCause(
+        unsent=jnp.where(is_silent, unsent, 0.0),
+        dropped=jnp.where(is_refused, refused[0], jnp.where(may_be_lost, dropped, 0.0)),
+        forced=jnp.where(is_refused, refused[1], jnp.where(may_be_lost, forced, 0.0)),
+    )
 
 
 def agrees_with_number(losses: jax.Array, counted: int) -> jax.Array:

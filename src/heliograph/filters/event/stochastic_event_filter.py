@@ -9,7 +9,13 @@ import numpy as np
 
 from heliograph.engine.choice import compile_on_call
 from heliograph.factors.covariance_factors import WeightedColumns, eliminate, join_columns, zero_covariance
-from heliograph.factors.factored_gaussian import Gaussian, condition_on_observation, from_columns, from_covariance
+from heliograph.factors.factored_gaussian import (
+    Gaussian,
+    condition_on_observation,
+    from_columns,
+    from_covariance,
+    from_covariance_by_elimination,
+)
 from heliograph.filters.base import AbstractSizedFilter, Step, corrects, estimates, predicts
 from heliograph.filters.event.gaussian_sum import FLOOR, GaussianSum, concatenate_sums, merge_groups, safe_log
 from heliograph.filters.gaussian.gaussian_prediction import (
@@ -28,7 +34,7 @@ from heliograph.model.estimate import Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor
-from heliograph.model.trigger import Periodic, StochasticTrigger
+from heliograph.model.trigger import REFUSED, Periodic, StochasticTrigger
 from heliograph.numerics.linalg import cholesky, psd_solve, symmetrize
 from heliograph.numerics.types import Array, ArrayLike, Float
 
@@ -183,7 +189,8 @@ class StochasticEventFilter(AbstractSizedFilter):
     ) -> GaussianSum:
         """Return one Gaussian given that no value came: the sender was silent (link up), or the link was down.
 
-        It merges `silent`, the Gaussian given silence, of weight P(up) P(silent), and `prior`, of weight P(down).
+        It merges `silent`, the Gaussian given silence, of weight P(up) P(silent), and `prior`, of weight P(down). If a
+        value came and is refused, it is the Gaussian given that y was sent, of weight P(up) P(sent).
 
         Args:
             prior: Gaussian of x before the step's data. That the link is down says nothing of x.
@@ -191,19 +198,45 @@ class StochasticEventFilter(AbstractSizedFilter):
             law: probabilities of the M modes of the link's Markov chain.
             channel: the link: probabilities `chance` of each pattern of arrivals in each mode, and which components
                 arrive (`present`).
-            down: a flag that the receiver gets, (1,): 1 if the link is down; (0,) if it gets none.
+            down: a flag that the receiver gets, (1,): 1 if the link is down, REFUSED (2) if a value came that it
+                refuses, else 0; (0,) if it gets none.
         """
         # P(nothing arrives | mode) (M,). Its status holds P(mode, link up or down), whose sum multiplies the weight.
         lost = jnp.asarray(channel.chance) @ (~jnp.any(jnp.asarray(channel.present), axis=1)).astype(float)
-        while_up = silent.with_sender_status(0, law[None] * (1 - lost))
-        if len(down):  # weight 0 if the flag says that the link is down
-            while_up = while_up.scale_weights(jnp.where(down[0] > 0, -jnp.inf, 0.0))
+        is_up, is_down = law[None] * (1 - lost), law[None] * lost
+        while_up = silent.with_sender_status(0, is_up)
         if not self.may_lose:
             return merge_groups(while_up)
-        while_down = _sum_of_one_gaussian(jnp.zeros(()), prior, law).with_sender_status(0, law[None] * lost)
-        if len(down):  # weight 0 if the flag says that the link is up
-            while_down = while_down.scale_weights(jnp.where(down[0] > 0, 0.0, -jnp.inf))
-        return merge_groups(concatenate_sums([while_up, while_down]))
+        while_down = _sum_of_one_gaussian(jnp.zeros(()), prior, law)
+        if not len(down):
+            return merge_groups(concatenate_sums([while_up, while_down.with_sender_status(0, is_down)]))
+        # The flag leaves one cause: silence, a link that is down (at least FLOOR, as the flag says so), or a refusal.
+        while_down = while_down.with_sender_status(0, jnp.maximum(is_down, FLOOR * law))
+        refused = self._condition_on_sent(prior, silent, law).with_sender_status(0, is_up)
+        flagged = down[0] > 0, down[0] == REFUSED
+        causes = concatenate_sums([
+            while_up.scale_weights(jnp.where(flagged[0], -jnp.inf, 0.0)),
+            while_down.scale_weights(jnp.where(flagged[0] & ~flagged[1], 0.0, -jnp.inf)),
+            refused.scale_weights(jnp.where(flagged[1], 0.0, -jnp.inf)),
+        ])  # fmt: skip
+        return merge_groups(causes)
+
+    def _condition_on_sent(self, prior: Gaussian, silent: GaussianSum, law: jax.Array) -> GaussianSum:
+        """Return the Gaussian of x given that y was sent, of weight P(sent), of which nothing else is known.
+
+        With s = P(silent), and m_s, P_s the mean and covariance of x given silence (`silent`), the law of total
+        probability gives the moments m + d, P_sent of x given that y was sent, from m = s m_s + (1 - s)(m + d). A
+        schedule (`Periodic`) says nothing of x.
+        """
+        if isinstance(self.trigger, Periodic):
+            return _sum_of_one_gaussian(jnp.zeros(()), prior, law)
+        s = jnp.minimum(jnp.exp(silent.log_weight[0]), 1 - FLOOR)  # so that 1 - s is not 0
+        given_silence: Gaussian = jax.tree.map(lambda leaf: leaf[0], silent.gaussian)
+        m, P = prior.mean, prior.covariance
+        d_s, P_s = given_silence.mean - m, given_silence.covariance
+        d = -s * d_s / (1 - s)
+        P_sent = (P - s * (P_s + jnp.outer(d_s, d_s))) / (1 - s) - jnp.outer(d, d)
+        return _sum_of_one_gaussian(jnp.log1p(-s), from_covariance_by_elimination(m + d, P_sent), law)
 
     def _average_link_moments(self, channel: ChannelByPattern, law: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return E G (m, p), and Cov((G, n)_ik, (G, n)_jl) [i, j, k, l] (m, m, p + 1, p + 1), for z = G y + n.

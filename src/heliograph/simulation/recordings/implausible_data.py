@@ -15,6 +15,7 @@ from heliograph.simulation.centres.uplinks import UplinkDraws
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.network_filters import AllFilters
 from heliograph.simulation.network_index import EstimateIndex
+from heliograph.simulation.recordings.screened_recording import say_taken_for_silence
 
 Stepped = tuple[PyTree, dict[str, PyTree]]  # the filters' states after a step, and their results
 
@@ -222,7 +223,9 @@ def describe_doubts(
         first_row, why = next(iter(by_row.items()))
         named = [faults.name_fault(node, name, first_row) for name in network.nodes[node].filters]
         fault = next((words for words in named if words), "")
-        lines.append(f"node {node!r}: {_format_rows(list(by_row))} implausible, as if not arrived: {why}{fault}")
+        taken_for = say_taken_for_silence(network.nodes[node])
+        rows_named = _format_rows(list(by_row))
+        lines.append(f"node {node!r}: {rows_named} implausible, as if not arrived: {why}{fault}{taken_for}")
     # Rows that one filter alone skips.
     judgements = {
         of_filter: Judgement(*(field[:, i.filter, i.node] for field in outputs["judged"][i.stack]))

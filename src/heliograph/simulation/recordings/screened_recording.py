@@ -10,8 +10,8 @@ from heliograph.model.over_time import first
 from heliograph.model.readings.reading_limits import ReadingLimits
 from heliograph.model.readings.repeated_readings import Repeats
 from heliograph.model.readings.timeouts import find_long_silences
-from heliograph.model.trigger import AbstractThreshold
-from heliograph.numerics.types import Float, Int
+from heliograph.model.trigger import AbstractThreshold, Periodic
+from heliograph.numerics.types import Bool, Float, Int
 from heliograph.simulation.node import Node, ReceivingNode
 
 RIM = 1e-9  # share of delta by which a value may lie inside for rounding
@@ -68,11 +68,11 @@ def screen_recording(
             if isinstance(node, Node) and node.trigger is not None:
                 accepted[name] = node.trigger.leave_out_refused(z[name], refused[name] > 0, len(node.outputs))
             lines = [
-                _describe_refused(reason, node.limits, z[name], refused[name], node)
+                _describe_refused(reason, node.limits, z[name], refused[name], node) + say_taken_for_silence(node)
                 for reason in count_by_reason(refused[name])
             ]
         # A sender with a rule (send on delta) should not have sent these values. They are reported, but stay in use.
-        if rows := find_forbidden_rows(node, accepted[name]):
+        if rows := find_forbidden_rows(node, accepted[name], np.any(refused[name], axis=1)):
             lines.append(
                 f"{len(rows)} values came that the rule of their sender forbids; row {rows[0] + 1}: "
                 "within delta of the value before, and no heartbeat due"
@@ -97,6 +97,18 @@ def leave_out_values(node: Node | ReceivingNode, z: Float[np.ndarray, "rows rece
     return trigger.leave_out_refused(z, np.broadcast_to(is_value, z.shape), len(node.outputs))
 
 
+def say_taken_for_silence(node: Node | ReceivingNode) -> str:
+    """Return what to add to a line on refused values if filters take them for silence of the node's sender; else "".
+
+    A sender that decides by its value sent one that is refused, too. Where the receiver is not told of losses, a filter
+    cannot know that, and takes its absence for a value near the last one.
+    """
+    trigger = node.trigger if isinstance(node, Node) else None
+    if trigger is None or isinstance(trigger, Periodic) or trigger.losses != "unknown":
+        return ""
+    return '; its sender\'s losses are "unknown", so that it is taken for silence, and errors exceed the claims'
+
+
 def _describe_refused(
     reason: Reason,
     limits: ReadingLimits,
@@ -116,12 +128,19 @@ def _describe_refused(
     # Keep only readings refused for this reason, and find the first row that has some.
     refused_so = np.where(refused == number_of_reason(reason), refused, 0)
     row = int(np.argmax(refused_so.any(axis=1)))
-    shares = f"{np.count_nonzero(refused_so)} of {np.count_nonzero(~np.isnan(z))} values"
+    values = (
+        z
+        if not isinstance(node, Node) or node.trigger is None
+        else z[:, : -node.trigger.side_information(len(node.outputs)) or None]
+    )
+    shares = f"{np.count_nonzero(refused_so)} of {np.count_nonzero(~np.isnan(values))} values"
     description = limits.describe_missing(z[row], refused_so[row], node.received_names)
     return f"{shares} count as not arrived, by {reason}; row {row + 1}: {description}"
 
 
-def find_forbidden_rows(node: Node | ReceivingNode, z: Float[np.ndarray, "steps received"]) -> list[int]:
+def find_forbidden_rows(
+    node: Node | ReceivingNode, z: Float[np.ndarray, "steps received"], refused: Bool[np.ndarray, " steps"]
+) -> list[int]:
     """Return the rows with values that their sender's rule forbids: no further than delta from the last value sent.
 
     Such rows show that the network describes the sender wrongly. A sender on delta sends if its measurement differs
@@ -131,7 +150,8 @@ def find_forbidden_rows(node: Node | ReceivingNode, z: Float[np.ndarray, "steps 
 
     Args:
         node: a node of the network, with its sender's rule (`trigger`) if it has one.
-        z: the node's measurements, NaN where nothing came.
+        z: the node's measurements, NaN where nothing came or is kept.
+        refused: rows of which a value was refused; the sender goes on from that value, so that the next is not judged.
     """
     trigger = node.trigger if isinstance(node, Node) else None
     if not isinstance(trigger, AbstractThreshold) or trigger.reference != "sent" or trigger.region == "each":
@@ -145,6 +165,7 @@ def find_forbidden_rows(node: Node | ReceivingNode, z: Float[np.ndarray, "steps 
     forbidden, last_row = list[int](), None
     for k, row in enumerate(z[:, : len(node.outputs)]):
         if np.isnan(row).any():
+            last_row = None if refused[k] else last_row
             continue
         if last_row is not None:
             heartbeat_is_due = trigger.heartbeat is not None and k - last_row >= trigger.heartbeat
