@@ -55,11 +55,11 @@ class MistakenBelief(NamedTuple):
     def words(self) -> str:
         """Return the mistake as a sentence such as "filter 'f' believes another channel than node 'a'".
 
-        `self.node` is FUSED for a filter of all nodes' measurements. RANGE in `self.parts` says that limits refuse some
-        readings, UNSAID that the filter does not tell for which models it was made.
+        `self.node` is FUSED for a filter of all nodes' measurements. RANGE in `self.parts` says that some readings are
+        refused, UNSAID that the filter does not tell for which models it was made.
         """
         place = "all nodes together" if self.node == FUSED else f"node {self.node!r}"
-        reason = ", where limits refuse some" if RANGE in self.parts else ""
+        reason = ", where some are refused" if RANGE in self.parts else ""
         preposition = "at" if self.parts == (UNSAID,) else "than"
         return f"filter {self.filter!r} believes {self.another} {preposition} {place}{reason}"
 
@@ -192,8 +192,11 @@ def find_assumed(network: HasNodes, name: str) -> AssumedModel:
     """
     node, plant = network.nodes[name], network.plant
     if isinstance(node, Node):
-        # Limits without bounds refuse only error codes of the sensor, and these depend on the state in no way.
-        limits = node.limits if node.limits is not None and node.limits.bounded else None
+        # Limits without bounds refuse only error codes of the sensor, which depend on the state in no way: to lose a
+        # value by them does no harm, unless filters take it for silence, or for a sign of the link's mode.
+        limits = node.limits
+        if limits is not None and not limits.bounded and not node.absence_tells:
+            limits = None
         return AssumedModel(plant, node.sensor, node.channel, node.trigger, range=limits, encoder=node.encoder)
     # Nodes that share one channel receive certain rows of it.
     if network.common is not None:

@@ -6,6 +6,7 @@ from typing import Protocol
 import equinox as eqx
 
 from heliograph.filters.base import AbstractFilter
+from heliograph.filters.modes.arrival_patterns import losses_tell_of_gains
 from heliograph.filters.wrappers.fed_back import FedBackFilter
 from heliograph.fusion.network_fusion import Fusion
 from heliograph.model.channel import Channel, check_sent
@@ -17,7 +18,7 @@ from heliograph.model.readings.reading_limits import LimitsLike, ReadingLimits, 
 from heliograph.model.readings.repeated_readings import StuckLike
 from heliograph.model.relays import RelayNetwork
 from heliograph.model.sensor import AbstractSensor, AnySensor
-from heliograph.model.trigger import AbstractTrigger
+from heliograph.model.trigger import AbstractTrigger, Periodic
 from heliograph.model.words.encoder import Words
 from heliograph.model.words.word_channel import FLAG, find_carried_components
 from heliograph.numerics.angles.angle import Angles
@@ -136,6 +137,15 @@ class Node(Module):
         Limits are bounds of plausible readings, or the number of equal readings after which a sensor counts as stuck.
         """
         return self.trigger is not None or (self.limits is not None and self.limits.bounded)
+
+    @property
+    def absence_tells(self) -> bool:
+        """Whether it says something that no value came: of the sender's signal, by its rule, or of the link's mode.
+
+        A reading that is refused is absent too. Behind such a node a filter takes that for silence, or for a loss.
+        """
+        decides = self.trigger is not None and not isinstance(self.trigger, Periodic)
+        return decides or losses_tell_of_gains(self.channel)
 
     @property
     def disturbs_what_is_sent(self) -> bool:

@@ -10,7 +10,7 @@ from heliograph.filters.event.event_filter import EventFilter
 from heliograph.filters.event.gaussian_in_ball import MOST_COMPONENTS
 from heliograph.filters.event.stochastic_event_filter import StochasticEventFilter
 from heliograph.filters.gaussian.moment_transforms import AbstractTransform, Cubature
-from heliograph.filters.modes.arrival_patterns import ChannelByPattern, describe_by_pattern
+from heliograph.filters.modes.arrival_patterns import ChannelByPattern, describe_by_pattern, has_same_law_in_every_mode
 from heliograph.model.assumed.assumed_model import AssumedModel, with_assumed
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Claim, lower_claim_by_noise
@@ -97,7 +97,7 @@ def event_filter(
         pieces=known,
         lost_references=lost,
         delivers_signal=all(_delivers_y_unchanged(step) for step in steps),
-        same_law_in_modes=all(_has_same_law_in_every_mode(step) for step in steps),
+        same_law_in_modes=all(has_same_law_in_every_mode(step) for step in steps),
         age_count=1 if trigger.heartbeat is None else int(trigger.heartbeat) + 1,
         **fields_of_both,
         **make_sizes("nominal", start, received),
@@ -147,7 +147,7 @@ def _may_lose_components(channel: ChannelByPattern) -> bool:
 
 def _has_known_gain(channel: ChannelByPattern) -> bool:
     """Return whether no gain is random, and what arrives is all that was sent, in every mode."""
-    return _has_same_law_in_every_mode(channel) and not np.any(_gain_and_noise_covariance(channel)[..., :-1, :-1])
+    return has_same_law_in_every_mode(channel) and not np.any(_gain_and_noise_covariance(channel)[..., :-1, :-1])
 
 
 def _gain_and_noise_covariance(channel: ChannelByPattern) -> np.ndarray:
@@ -188,23 +188,6 @@ def _arrival_determines_y(channel: ChannelByPattern) -> bool:
         is_noise_free = arrives.all() and not np.any(_gain_and_noise_covariance(channel)[j, a])
         if not is_noise_free or np.linalg.matrix_rank(scaled_gain) < gain.shape[1]:
             return False
-    return True
-
-
-def _has_same_law_in_every_mode(channel: ChannelByPattern) -> bool:
-    """Return whether what arrives has the same mean and covariance in every mode in which it can arrive.
-
-    This must hold for each pattern of arrivals (which components come). Then a value needs one update, not one for each
-    mode of the link.
-    """
-    possible = np.asarray(channel.chance) > 0  # (mode, pattern of arrivals)
-    for a, modes in enumerate(possible.T):
-        if not channel.present[a].any() or not modes.any():
-            continue
-        for moment in (np.asarray(channel.mean), np.asarray(channel.covariance)):  # (mode, pattern, ...) each
-            by_mode = moment[modes, a]
-            if not np.array_equal(by_mode, np.broadcast_to(by_mode[:1], by_mode.shape)):
-                return False
     return True
 
 

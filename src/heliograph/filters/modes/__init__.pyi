@@ -6,6 +6,8 @@ from .additive_links import independent_terms as independent_terms
 from .arrival_patterns import ChannelByPattern as ChannelByPattern
 from .arrival_patterns import append_flag as append_flag
 from .arrival_patterns import describe_by_pattern as describe_by_pattern
+from .arrival_patterns import has_same_law_in_every_mode as has_same_law_in_every_mode
+from .arrival_patterns import losses_tell_of_gains as losses_tell_of_gains
 from .arrival_patterns import pattern_of as pattern_of
 from .channel_by_mode import ChannelByMode as ChannelByMode
 from .channel_by_mode import channels_by_mode as channels_by_mode

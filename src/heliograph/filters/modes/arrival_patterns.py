@@ -8,12 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.factors.covariance_factors import WeightedColumns
+from heliograph.model.channel import Channel
+from heliograph.model.over_time import first, unstack
 from heliograph.numerics.module import Module
-from heliograph.numerics.numpy_or_jax import library
+from heliograph.numerics.numpy_or_jax import is_traced, library
 from heliograph.numerics.types import Array, Bool, Float
 from heliograph.random_affine.base import ArrivalOutcome
 from heliograph.random_affine.erasure import second_moments
-from heliograph.random_affine.modes import JointModes
+from heliograph.random_affine.memories_of_channels import memories
+from heliograph.random_affine.modes import JointModes, joint_modes
 from heliograph.random_affine.moments.gain_and_noise_covariances import join_gain_and_noise, split_off_noise
 from heliograph.random_affine.moments.moment_tensors import symmetric_product
 
@@ -111,6 +114,44 @@ def _describe_step_by_pattern(
         noise=noise,
         flags=flags,
     )
+
+
+def has_same_law_in_every_mode(channel: ChannelByPattern) -> bool:
+    """Return whether what arrives has the same mean and covariance in every mode in which it can arrive.
+
+    This must hold for each pattern of arrivals (which components come). Then a value needs one update, not one for each
+    mode of the link.
+    """
+    possible = np.asarray(channel.chance) > 0  # (mode, pattern of arrivals)
+    for a, modes in enumerate(possible.T):
+        if not channel.present[a].any() or not modes.any():
+            continue
+        for moment in (np.asarray(channel.mean), np.asarray(channel.covariance)):  # (mode, pattern, ...) each
+            by_mode = moment[modes, a]
+            if not np.array_equal(by_mode, np.broadcast_to(by_mode[:1], by_mode.shape)):
+                return False
+    return True
+
+
+def losses_tell_of_gains(channel: Channel) -> bool:
+    """Return whether what is lost says something of the law of what arrives, since a mode of the link decides on both.
+
+    A link that was good for a while loses little and has a large gain, say. Then a filter that reckons with the modes
+    takes a value that is refused for one that was lost, and so for a sign of a bad link.
+
+    Args:
+        channel: a link, with its losses; it may vary over time.
+    """
+    link = first(channel)
+    if not (link.erases and link.remembers):
+        return False
+    # Delays and gains that drift have no finite number of modes here, and of traced numbers nothing can be said.
+    drifts = any(memory.drifts for memory in memories(link).values())
+    if link.past or drifts or any(is_traced(leaf) for leaf in jax.tree.leaves(channel)):
+        return True
+    modes = [joint_modes(step) for step in unstack(channel)]
+    no_flags = np.ones((len(modes[0].initial), 1))
+    return not all(has_same_law_in_every_mode(step) for step in describe_by_pattern(modes, no_flags))
 
 
 class HasPatterns(Protocol):
