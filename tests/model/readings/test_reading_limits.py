@@ -121,3 +121,15 @@ def test_a_code_is_equal_in_the_type_in_which_it_came(value, code, same):
     limits, z = limits_of(1, None, code), np.array([value])
     assert limits.outside(z).tolist() == [same]
     assert ("is a code" in limits.describe_missing(z, limits.find_refusal_reasons(z), ["z"])) == same
+
+
+def test_one_pair_of_limits_is_for_what_is_measured():
+    """Limits of a temperature took the number of lost messages, and the link's gain, for temperatures out of range."""
+    sensor, rule = hg.LinearSensor([[1.0]], 0.1), hg.SendOnDelta(0.3, losses="known")
+    counted = hg.Node(sensor, hg.erasure(hg.perfect(), 0.8), {}, trigger=rule, limits=(10, 60), stuck=5)
+    told = hg.Node(sensor, hg.hop(hg.Rayleigh(0.8), 0.1, known=True), {}, limits=(10, 60), stuck=5)
+    each = hg.Node(sensor, hg.hop(hg.Rayleigh(0.8), 0.1, known=True), {}, limits=[(10, 60), (0.1, 5)], stuck=[5, 3])
+    for node, low, counts in ((counted, [10, -np.inf], [5, np.inf]), (told, [10, -np.inf], [5, np.inf]),
+                              (each, [10, 0.1], [5, 3])):  # fmt: skip
+        np.testing.assert_array_equal(node.limits.low, low)
+        np.testing.assert_array_equal(node.limits.stuck, counts)

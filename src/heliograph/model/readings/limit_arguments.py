@@ -13,14 +13,18 @@ StateLimits = tuple[tuple[str, tuple[float, float]], ...]  # of each limited sta
 StateLimitsLike = TypeAliasType("StateLimitsLike", "Mapping[str, Sequence[float | None]] | StateLimits")
 
 
-def read_intervals(limits: object, received: int, name: str = "limits") -> Float[np.ndarray, "m 2"]:
+def read_intervals(
+    limits: object, received: int, name: str = "limits", values: Sequence[int] | None = None
+) -> Float[np.ndarray, "m 2"]:
     """Return (low, high) for each received number, infinite where there is no limit, from limits as users give them.
 
     Args:
-        limits: (low, high) for all received numbers, or such a pair for each, None in place of an end without a limit;
-            None for no limits.
+        limits: (low, high) for all measured values, or such a pair for each received number, None in place of an end
+            without a limit; None for no limits.
         received: how many numbers are received.
         name: what the limits are called in errors.
+        values: which of them are measured values; others are told about the link, such as its gain. None (default):
+            all.
 
     Raises:
         ValueError: what is no such pair or list of pairs, a low end that is not below the high one.
@@ -30,12 +34,15 @@ def read_intervals(limits: object, received: int, name: str = "limits") -> Float
         return np.tile(no_limits, (received, 1))
     expected = f"(low, high), or such a pair for each of {received} received numbers, None where there is no limit"
     try:
-        values = np.asarray(limits, dtype=object)
+        pairs_given = np.asarray(limits, dtype=object)
     except (TypeError, ValueError):
         raise fail(name, expected, show_value(limits)) from None
-    if values.shape not in ((2,), (received, 2)):
+    if pairs_given.shape not in ((2,), (received, 2)):
         raise fail(name, expected, show_value(limits))
-    rows = np.tile(values, (received, 1)) if values.ndim == 1 else values
+    pair_for_all = pairs_given.ndim == 1
+    rows = np.tile(pairs_given, (received, 1)) if pair_for_all else np.array(pairs_given)
+    if pair_for_all and values is not None:  # what is told about the link has no such limits
+        rows[[i for i in range(received) if i not in values]] = None
     pairs = [[end if bound is None else bound for bound, end in zip(row, no_limits, strict=True)] for row in rows]
     intervals = read_numbers(name, pairs, expected)
     if np.any(~(intervals[:, 0] < intervals[:, 1])):

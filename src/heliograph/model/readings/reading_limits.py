@@ -7,7 +7,9 @@ import numpy as np
 from typing_extensions import TypeAliasType
 
 from heliograph.model.channel import Channel
+from heliograph.model.channel_side_information import separate_told_numbers
 from heliograph.model.checks.refusal_reasons import Reason, number_of_reason
+from heliograph.model.over_time import first
 from heliograph.model.readings.limit_arguments import read_intervals, read_numbers
 from heliograph.model.readings.repeated_readings import Repeats, StuckLike, count_repeats, find_stuck_counts
 from heliograph.model.sensor import AnySensor
@@ -37,17 +39,19 @@ def make_limits(
     Args:
         received: how many numbers are received.
         limits: lowest and highest valid numbers, None for no limits, or the whole rule of another node, which is
-            returned as it is.
+            returned as it is. One pair is for the measured values, not for what is told about the link.
         invalid: codes that are no readings.
         stuck: after how many equal readings a sensor counts as stuck (`find_stuck_counts`); True: by the noise and
             resolution of the `sensor`.
         sensor: the node's sensor, None where there is none.
-        channel: its channel, which must deliver readings as they are if `stuck` is True.
+        channel: its channel, which must deliver readings as they are if `stuck` is True, and which says what of the
+            received numbers are values.
 
     Raises:
         ValueError: limits of another number of readings, or further codes beside those of another node.
     """
-    codes, counts = read_numbers("invalid values", invalid), find_stuck_counts(received, stuck, sensor, channel)
+    codes, values = read_numbers("invalid values", invalid), _find_values(received, channel)
+    counts = find_stuck_counts(received, stuck, sensor, channel, values)
     if isinstance(limits, ReadingLimits):
         if len(limits.low) != received or codes.size or counts is not None:
             more = " and further codes" * bool(codes.size) + " and stuck=" * (counts is not None)
@@ -56,7 +60,16 @@ def make_limits(
         return limits
     if limits is None and codes.size == 0 and counts is None:
         return None
-    return ReadingLimits(received, limits, invalid, counts)
+    return ReadingLimits(received, limits, invalid, counts, values)
+
+
+def _find_values(received: int, channel: Channel | None) -> Sequence[int]:
+    """Return which of the received numbers are measured values: those that the channel's link delivers.
+
+    The others are told about the link: its gain, what a message declares, how many messages were lost. Without a
+    channel all count as values.
+    """
+    return range(received) if channel is None else separate_told_numbers(first(channel)).values
 
 
 class ScreenedReadings(NamedTuple):
@@ -85,11 +98,12 @@ class ReadingLimits(Module):
 
     Args:
         received: length m of a measurement.
-        limits: lowest and highest valid number of each component; None for no limits. Stored as low and high (m,), with
-            -inf and inf where there is none.
+        limits: lowest and highest valid number of each component, or of all `values`; None for no limits. Stored as low
+            and high (m,), with -inf and inf where there is none.
         invalid: codes (codes,) that are no measurements.
         stuck: after how many equal readings in a row one counts as missing (m,), infinite for those that may repeat;
             None where all may.
+        values: which components are measured values; None: all.
     """
 
     low: Float[np.ndarray, " m"]
@@ -103,17 +117,19 @@ class ReadingLimits(Module):
         limits: LimitsLike = None,
         invalid: ArrayLike = (),
         stuck: Float[np.ndarray, " m"] | None = None,
+        values: Sequence[int] | None = None,
     ):
         """Check and hold which received numbers count as missing: beyond limits, codes, or repeated too often.
 
         Args:
             received: length m of a measurement.
-            limits: (low, high) for all components or for each; None for no limits.
+            limits: (low, high) for all values or for each component; None for no limits.
             invalid: codes that are no measurements, a number or several.
             stuck: for each component, how many equal readings in a row count as missing from then on; None for no such
                 rule.
+            values: which components are measured values, which one pair of limits is for; None: all.
         """
-        intervals = read_intervals(limits, received)
+        intervals = read_intervals(limits, received, values=values)
         self.low, self.high = intervals[:, 0], intervals[:, 1]
         codes = read_numbers("invalid values", invalid)
         if codes.ndim > 1 or not np.all(np.isfinite(codes)):
@@ -123,8 +139,12 @@ class ReadingLimits(Module):
     @property
     def bounded(self) -> bool:
         """Whether a number may count as missing for its value, which tells of the state as a code does not."""
-        has_limits = bool(np.any(np.isfinite(self.low)) or np.any(np.isfinite(self.high)))
-        return has_limits or self.stuck is not None  # a run of equal readings is found by their values too
+        return self.has_range or self.stuck is not None  # a run of equal readings is found by their values too
+
+    @property
+    def has_range(self) -> bool:
+        """Whether some number counts as missing below or above a limit."""
+        return bool(np.any(np.isfinite(self.low)) or np.any(np.isfinite(self.high)))
 
     def screen(self, z: Float[np.ndarray, "time m"], before: Repeats = FIRST) -> ScreenedReadings:
         """Return the readings without those that count as missing, from runs of equal readings before them (`before`).

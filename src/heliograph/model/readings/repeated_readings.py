@@ -153,7 +153,7 @@ def longest_run_by_chance(equal: Float[np.ndarray, "..."]) -> Float[np.ndarray, 
 
 
 def find_stuck_counts(
-    received: int, stuck: StuckLike, sensor: AnySensor | None, channel: Channel | None
+    received: int, stuck: StuckLike, sensor: AnySensor | None, channel: Channel | None, values: Sequence[int]
 ) -> Float[np.ndarray, " received"] | None:
     """Return of each received number how many equal readings in a row mean that its sensor is stuck.
 
@@ -162,9 +162,11 @@ def find_stuck_counts(
     Args:
         received: how many numbers are received.
         stuck: True for as many as noise and resolution of the sensor give once in 10^9 readings; or a whole number; or
-            None or False for a number that may repeat; or a list with one of these for each.
+            None or False for a number that may repeat; or a list with one of these for each received number, as one
+            alone is for all measured values.
         sensor: the sensor, whose noise and resolution are needed if `stuck` is True.
         channel: its channel, which must deliver the outputs as they were sent.
+        values: which of the received numbers are measured values; what is told about the link may repeat.
 
     Returns:
         Counts (received,), infinite for a number that may repeat; None where all may.
@@ -172,12 +174,13 @@ def find_stuck_counts(
     Raises:
         ValueError: another count of them, fewer than 2 readings, a sensor or a channel that does not say.
     """
-    # One answer for all received numbers, or one for each.
+    # One answer for all values, or one for each received number.
     expected = f"True, a whole number of equal readings from 2 to {MOST:,}, None, or a list of {received} of these"
     is_for_all = stuck is None or isinstance(stuck, bool | np.bool_) or is_whole(stuck)
     if not is_for_all and not isinstance(stuck, Sequence | np.ndarray):
         raise fail("stuck", expected, show_value(stuck))
-    each = [stuck] * received if is_for_all else list(stuck)  # type: ignore[arg-type]
+    for_all = [stuck if i in values else None for i in range(received)]
+    each = for_all if is_for_all else list(stuck)  # type: ignore[arg-type]
     if isinstance(stuck, str) or len(each) != received:  # a text is a sequence too
         raise fail("stuck", expected, show_value(stuck))
     counts = np.full(received, np.inf)
