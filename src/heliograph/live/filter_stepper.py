@@ -355,7 +355,7 @@ class CompiledFilter:
         """
         if self.sender is None:
             return np.asarray(screened.values[0])  # of one reading, (1, received)
-        return self.sender.trigger.leave_out_refused(z, screened.refused[0] > 0, self.sender.outputs)
+        return np.asarray(self.sender.trigger.leave_out_refused(z, screened.refused[0] > 0, self.sender.outputs))
 
     def make_stepper(self) -> NativeFilterStepper | XlaFilterStepper:
         """Return a new stepper of the filter whose state is the initial law (`_start`).

@@ -10,7 +10,7 @@ import numpy as np
 from heliograph.numerics.check import TINY, array, check_count, covariance, fail, rank, scalar, show_value
 from heliograph.numerics.domains import POSITIVE, report_domain
 from heliograph.numerics.module import Module, readable, unwritten
-from heliograph.numerics.numpy_or_jax import is_traced
+from heliograph.numerics.numpy_or_jax import is_traced, library
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int
 
 Reference = Literal["sent", "acknowledged", "prediction", "zero"]
@@ -75,26 +75,26 @@ class AbstractTrigger(Module):
         return outputs if self.region == "each" else 1
 
     def leave_out_refused(
-        self, z: Float[np.ndarray, "*rows received"], refused: Bool[np.ndarray, "*rows received"], outputs: int
-    ) -> Float[np.ndarray, "*rows received"]:
+        self, z: Float[Array, "*rows received"], refused: Bool[Array, "*rows received"], outputs: int
+    ) -> Float[Array, "*rows received"]:
         """Return what was received without the readings that are refused, although they were sent.
 
         A message of which no value is left was sent all the same: where losses are "known", REFUSED stands behind z;
         where they are "numbered", its number stays; where they are "unknown" it cannot be told from silence.
 
-        Args:
-            z: what was received, the numbers about losses last.
-            refused: which of it is refused.
-            outputs: number of outputs of the sensor.
+        z: what was received, the numbers about losses last; refused: which of it is; outputs: number of the sensor's.
         """
-        left = np.where(refused, np.nan, z)
-        if self.losses == "known":
-            count = z.shape[-1] - self.side_information(outputs)
-            came, stays = ~np.isnan(z[..., :count]), ~np.isnan(left[..., :count])
-            if self.region != "each":  # all values are one message
-                came, stays = (np.asarray(mask.any(axis=-1, keepdims=True)) for mask in (came, stays))
-            left[..., count:] = np.where(came & ~stays, REFUSED, left[..., count:])
-        return left
+        xp = library(z)
+        left: Array = xp.where(refused, np.nan, z)
+        if self.losses != "known":
+            return left
+        count = z.shape[-1] - self.side_information(outputs)
+        came, stays = ~xp.isnan(z[..., :count]), ~xp.isnan(left[..., :count])
+        if self.region != "each":  # all values are one message
+            came, stays = (mask.any(axis=-1, keepdims=True) for mask in (came, stays))
+        numbers: Array = xp.where(came & ~stays, REFUSED, left[..., count:])
+        with_numbers: Array = xp.concatenate([left[..., :count], numbers], axis=-1)
+        return with_numbers
 
     def event(self, error: jax.Array, key: jax.Array, k: jax.Array) -> jax.Array:
         """Decide for each component whether error = y - reference, (m,), makes it be sent at step k."""

@@ -50,9 +50,9 @@ class Node(Module):
         sensor: the sensor.
         channel: the true channel from the sensor to the filters.
         filters: filters by name.
-        limits: range of an honest received number, (low, high) for all of them or a pair for each, None where there
-            is no limit; or another node's `limits`, which hold its codes too. Recorded and live data outside count as
-            not arrived, are counted and named. What is refused then depends on the state, so that claims are nominal.
+        limits: range of an honest measured value, (low, high) for all of them or a pair for each received number, None
+            where there is no limit; or another node's `limits`, which hold its codes too. What is outside counts as not
+            arrived, is counted and named. What is refused then depends on the state, so that claims are nominal.
         invalid: a code, or several, by which the sensor says that it has no value (-999); none by default.
         stuck: after how many equal readings in a row one counts as not arrived, a number or one for each; True for
             what the sensor's noise and resolution make less than once in 10^9 readings; None (default) where readings
@@ -129,6 +129,12 @@ class Node(Module):
         if self.informed_by is not None and receiving != [self.informed_by]:
             expected = f"no filter with measurements besides {self.informed_by!r}"
             raise fail("node whose sensor has feedback", expected, receiving)
+
+    @property
+    def counts_all(self) -> bool:
+        """Whether all that is sent arrives, always, and none of it is refused for a value beyond limits."""
+        has_range = self.limits is not None and self.limits.has_range
+        return self.complete and not has_range
 
     @property
     def chosen_by_value(self) -> bool:
@@ -211,6 +217,11 @@ class ReceivingNode(Module):
     def received_names(self) -> tuple[str, ...]:
         """Names of the components of the measurement."""
         return name_values(self.outputs, self.received)
+
+    @property
+    def counts_all(self) -> bool:
+        """Whether all that is sent arrives, always: nothing is refused here."""
+        return self.complete
 
     @property
     def limits(self) -> None:

@@ -151,7 +151,7 @@ def _return_with_warnings(result: Result, network: Network) -> Result:
     """Return the result as it is; warn if it is a record with numbers that are not finite or states beyond limits."""
     if isinstance(result, Record):
         _warn_beyond_limits(result, network)
-        complete = [name for name, node in network.nodes.items() if isinstance(node, Node) and node.complete]
+        complete = [name for name, node in network.nodes.items() if isinstance(node, Node) and node.counts_all]
         warn_of_non_finite_numbers(result, complete, stacklevel=4)
     return result
 

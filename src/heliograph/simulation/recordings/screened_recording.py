@@ -66,7 +66,8 @@ def screen_recording(
             repeats[name] = screened.repeats
             accepted[name], refused[name] = screened.values, screened.refused.astype(np.int8)
             if isinstance(node, Node) and node.trigger is not None:
-                accepted[name] = node.trigger.leave_out_refused(z[name], refused[name] > 0, len(node.outputs))
+                left = node.trigger.leave_out_refused(z[name], refused[name] > 0, len(node.outputs))
+                accepted[name] = np.asarray(left)
             lines = [
                 _describe_refused(reason, node.limits, z[name], refused[name], node) + say_taken_for_silence(node)
                 for reason in count_by_reason(refused[name])
@@ -94,7 +95,7 @@ def leave_out_values(node: Node | ReceivingNode, z: Float[np.ndarray, "rows rece
     if trigger is None:
         return np.full_like(z, np.nan)
     is_value = np.arange(z.shape[1]) < z.shape[1] - trigger.side_information(len(node.outputs))
-    return trigger.leave_out_refused(z, np.broadcast_to(is_value, z.shape), len(node.outputs))
+    return np.asarray(trigger.leave_out_refused(z, np.broadcast_to(is_value, z.shape), len(node.outputs)))
 
 
 def say_taken_for_silence(node: Node | ReceivingNode) -> str:

@@ -103,7 +103,18 @@ def _stack_group(network: Network, nodes: Mapping[str, Node], memories_of: Mappi
         encoder=_stack_if_any([node.encoder for node in nodes.values()]),
         informed_at=None if index_of_reference is None else (index_of_reference.stack, index_of_reference.filter),
         reader=None if first_node.encoder is None else make_word_reader(first_node.channel),
+        range=_stack_ranges(list(nodes.values())),
     )
+
+
+def _stack_ranges(nodes: Sequence[Node]) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the lowest and the highest numbers that count at some nodes (node, received); None where all count."""
+    if not any(node.limits is not None and node.limits.has_range for node in nodes):
+        return None
+    no_limit = np.full(nodes[0].received, np.inf)
+    low = np.stack([-no_limit if node.limits is None else node.limits.low for node in nodes])
+    high = np.stack([no_limit if node.limits is None else node.limits.high for node in nodes])
+    return low, high
 
 
 def _stack_if_any(parts: Sequence[PyTree]) -> PyTree:

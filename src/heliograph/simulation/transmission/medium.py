@@ -25,7 +25,7 @@ from heliograph.model.trigger import AbstractTrigger, SenderState
 from heliograph.model.words.encoder import WordReader, Words
 from heliograph.numerics.angles.angle import wrap_angles
 from heliograph.numerics.module import Module, unwritten
-from heliograph.numerics.types import PyTree
+from heliograph.numerics.types import Array, Float, PyTree
 from heliograph.random_affine.memories_of_channels import condition_on_memories
 from heliograph.simulation.random_keys import DITHER, SENSOR, TRIGGER, checksum, draw_key
 from heliograph.simulation.runs.stacked_filters import map_all
@@ -81,6 +81,7 @@ class NodeGroup(Module):
         encoder: of the words that nodes send; None where they send y.
         informed_at: (stack, number within the stack) of the `reference_filter`; None without.
         reader: puts the bits that arrive together to words; None without words.
+        range: lowest and highest number that counts (node, received); what is beyond is refused. None without limits.
     """
 
     sensor: AnySensor
@@ -94,6 +95,7 @@ class NodeGroup(Module):
     encoder: Words | None
     informed_at: tuple[int, int] | None = eqx.field(static=True)
     reader: WordReader | None = eqx.field(static=True)
+    range: tuple[Float[Array, "node received"], Float[Array, "node received"]] | None
 
 
 class NodesWithoutSensor(Module):
@@ -236,14 +238,33 @@ def _transmit(
         y = y - reference
     y, z, memory = _send_through_channel(node, link.memory, y, key, k)
     if node.trigger is None or link.sender is None:  # it always sends
-        return LinkState(memory=memory, feed_back=link.feed_back, modes=modes), z
+        return LinkState(memory=memory, feed_back=link.feed_back, modes=modes), _leave_out_refused(node, z, len(y))
     # The sender sends or not by how far y is from a reference: its own, or the filter's prediction r.
     sender = link.sender
     if node.trigger.reference == "prediction" and reference is not None:
         sender = sender._replace(reference=reference)
     drawn = draw_key(key, k, node.checksums, TRIGGER)
     sender, z = node.trigger.receive_if_sent(sender, y, z, drawn, k)
+    z = _leave_out_refused(node, z, len(y))
     return LinkState(memory=memory, feed_back=link.feed_back, sender=sender, modes=modes), z
+
+
+def _leave_out_refused(node: NodeGroup, z: jax.Array, outputs: int) -> jax.Array:
+    """Return what a node received without the numbers beyond its limits, NaN in their place, as of recorded data.
+
+    Args:
+        node: the node, with the `range` of what counts, and the trigger by which its sender sends: a value that is
+            refused was sent all the same.
+        z: what it received (received,).
+        outputs: length of the sensor's signal.
+    """
+    if node.range is None:
+        return z
+    low, high = node.range
+    is_refused = (z < low) | (z > high)
+    if node.trigger is None:
+        return jnp.where(is_refused, jnp.nan, z)
+    return jnp.asarray(node.trigger.leave_out_refused(z, is_refused, outputs))
 
 
 def _send_through_channel(
