@@ -92,7 +92,9 @@ SHAPES = [
     (lambda: h.Discrete([[1.0]], [1.0]), "gain values", "shape (1, 1)"),
     (lambda: h.Discrete([1.0, 2.0], [1.0]), "gain probabilities", "shape (1,)"),
     (lambda: one_per_step(2, 3), "OverTime", "['2', '3']"),
-    (lambda: h.model.over_time([h.perfect(1), h.perfect(2)]), "stack", "objects that differ"),
+    (lambda: h.model.over_time([h.perfect(1), h.perfect(2)]), "over_time", "shape (2, 2) of number 1"),
+    (lambda: h.model.over_time([h.hop(1.0, 0.1), h.hop(h.Rayleigh(0.8), 0.1)]), "over_time", "law: Constant of num"),
+    (lambda: h.model.over_time([h.perfect(), h.erasure(h.perfect(), 0.9)]), "over_time", "Erasure of number 1"),
 ]  # fmt: skip
 
 PROBABILITIES = [

@@ -191,11 +191,11 @@ def _describe_settings_and_compute_chunks(
 
 
 def _list_jobs(campaign: Campaign, only: Sequence[tuple[int, int]] | None) -> list[Job]:
-    """Return the chunks to compute, all or those of `only`, which must be the campaign's."""
+    """Return the chunks to compute, each once: all, or those of `only`, which must be the campaign's."""
     all_jobs = [Job(chunk.setting, chunk.number) for chunk in campaign.all_chunks()]
     if only is None:
         return all_jobs
-    jobs, known = [Job(setting, chunk) for setting, chunk in only], set(all_jobs)
+    jobs, known = [*dict.fromkeys(Job(setting, chunk) for setting, chunk in only)], set(all_jobs)
     unknown = [job for job in jobs if job not in known]
     if unknown:
         last = all_jobs[-1]

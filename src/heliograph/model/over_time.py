@@ -1,6 +1,7 @@
 """Models that vary over time: the marker `OverTime`, whose leading axis is time, and `at`, the model of one step."""
 
 from collections.abc import Callable, Hashable, Sequence
+from dataclasses import fields
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -9,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import fail, show_value
 from heliograph.numerics.check import items as as_items
 from heliograph.numerics.module import Module, readable
 from heliograph.numerics.types import PyTree
@@ -50,23 +51,52 @@ def _list_arrays(tree: object) -> list[PyTree]:
     return [leaf for leaf in jax.tree.leaves(tree) if eqx.is_array(leaf)]
 
 
-def stack(models: Sequence[T]) -> T:
+def stack(models: Sequence[T], name: str = "stack") -> T:
     """Stack model objects of one structure into one object whose arrays have a new leading axis.
 
     Everything that is no array must be the same in all of them, and is kept.
+
+    Args:
+        models: the objects.
+        name: what they are called in an error.
 
     Raises:
         ValueError: objects of different structures, or arrays of different shapes.
     """
     leaves_and_structures = [jax.tree.flatten(model) for model in models]
     if len({_describe_structure(leaves, structure) for leaves, structure in leaves_and_structures}) != 1:
-        raise fail("stack", "objects of one structure and one set of shapes", "objects that differ")
+        raise fail(name, "objects of one structure and one set of shapes", _describe_difference(models))
     leaf_of_models = zip(*(leaves for leaves, _ in leaves_and_structures), strict=True)
     # Leaves that are not arrays are the same in all models.
     stacked = [_stack_leaves(*leaves) if eqx.is_array(leaves[0]) else leaves[0] for leaves in leaf_of_models]
     _leaves, structure = leaves_and_structures[0]
     stacked_model: T = jax.tree.unflatten(structure, stacked)
     return stacked_model
+
+
+def _describe_difference(models: Sequence[object]) -> str:
+    """Return in words the first part in which one of several models has another structure than the first model.
+
+    Such as "law: Constant of number 0, Rayleigh of number 3".
+    """
+    i = next(i for i, model in enumerate(models) if not have_same_structure(model, models[0]))
+    a, b, path = models[0], models[i], list[str]()
+    # Go down into the first part that differs, as long as both are modules of one class.
+    while type(a) is type(b) and isinstance(a, Module):
+        differing = [f.name for f in fields(a) if not have_same_structure(getattr(a, f.name), getattr(b, f.name))]
+        if not differing:
+            break
+        a, b = getattr(a, differing[0]), getattr(b, differing[0])
+        path.append(differing[0])
+    part = f"{'.'.join(path)}: " if path else ""
+    return f"{part}{_name_structure(a)} of number 0, {_name_structure(b)} of number {i}"
+
+
+def _name_structure(part: Any) -> str:
+    """Return the shape of an array, the class of a model, or anything else as it is."""
+    if eqx.is_array(part):
+        return f"shape {np.shape(part)}"
+    return type(part).__name__ if isinstance(part, Module) else show_value(part)
 
 
 def structure_key(model: object) -> Hashable:
@@ -105,7 +135,7 @@ def over_time(items: Sequence[object]) -> OverTime:
     items = as_items("over_time", items, "objects, one for each step")
     if not items:
         raise fail("over_time", "at least one item", "none")
-    return OverTime(stack(align_memories_over_time(items)))
+    return OverTime(stack(align_memories_over_time(items), "over_time"))
 
 
 def at(tree: PyTree, k: int | np.integer | Int[np.ndarray | Array, ""]) -> PyTree:
