@@ -103,7 +103,6 @@ class AllFilters(Module):
         self.meshes = build_meshes(network)
         self.tests = make_fused_innovations(network, self.stacks) if tests else {}
         self.order = find_measurement_order(network.groups, network.rows)
-        # Whether all that the nodes of a group are sent arrives and counts.
         self.complete = tuple(all(network.nodes[name].counts_all for name in names) for names in network.groups)
         self.n = len(network.states)
 
