@@ -40,6 +40,7 @@ def export(
     from heliograph.disk.quoted_text import visible
     from heliograph.export.c_files import PRECISIONS, check_source_path, measure_step_cost, write_filter_files
     from heliograph.export.c_text import find_claim_at_precision
+    from heliograph.export.received_numbers import Received
     from heliograph.files.network_file import load_network
     from heliograph.simulation.centres.named_filter import find_filter_by_name
 
@@ -47,7 +48,8 @@ def export(
     check_source_path(out)
     named = find_filter_by_name(load_network(network), filter, node)
     # Write the files, then compile and time them.
-    written = write_filter_files(named.filter, named.received, out, precision, apart, size, window)
+    received = Received(named.received, named.refused_values, named.leave_out_refused, named.looks_for_stuck)
+    written = write_filter_files(named.filter, received, out, precision, apart, size, window)
     exported, real = named.filter, PRECISIONS[precision]
     measured = measure_step_cost(written.header, written.source, exported.received, len(exported.inputs), real)
     claim = find_claim_at_precision(exported, real)

@@ -4,7 +4,6 @@ import re
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,6 +13,7 @@ from jax.tree_util import keystr, tree_flatten_with_path
 from heliograph.disk.atomic_files import check_writable, whole_files
 from heliograph.export.c_text import MADE, CText, CTextOptions, generate_header_and_source
 from heliograph.export.late_measurement_window import check_and_count_window_steps
+from heliograph.export.received_numbers import Received
 from heliograph.export.step_program import RESERVED, Real, lower_step_to_c_functions
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.linear.scheduled_gains import ScheduledFilter
@@ -87,12 +87,15 @@ def export_c(
     """
     if isinstance(filter, Network):
         named = find_filter_by_name(filter, "" if name is None else name, node)
-        return write_filter_files(named.filter, named.received, path, precision, apart=apart, size=size, window=window)
+        received = Received(named.received, named.refused_values, named.leave_out_refused, named.looks_for_stuck)
+        return write_filter_files(named.filter, received, path, precision, apart=apart, size=size, window=window)
     if name is not None or node is not None:
         raise fail("export by name", "a network", show_value(filter))
     what = "a filter, or a network and the name of its filter or fusion"
     checked: AbstractFilter = instance("export", filter, AbstractFilter, what)
-    return write_filter_files(checked, _name_received(checked), path, precision, apart=apart, size=size, window=window)
+    return write_filter_files(
+        checked, Received(_name_received(checked)), path, precision, apart=apart, size=size, window=window
+    )
 
 
 def _name_received(filter: AbstractFilter) -> tuple[str, ...]:
@@ -103,7 +106,7 @@ def _name_received(filter: AbstractFilter) -> tuple[str, ...]:
 
 def write_filter_files(
     filter: AbstractFilter,
-    received: Sequence[str],
+    received: Received,
     path: str | Path,
     precision: str,
     apart: bool = False,
@@ -112,7 +115,8 @@ def write_filter_files(
 ) -> Exported:
     """Write a filter as two files of C, and return what was written, as `export_c` does for a user's filter.
 
-    `received` are the names of the measurement's components; the other arguments are those of `export_c`.
+    `received`: names of the measurement's components, and which of their values are refused; the other arguments are
+    those of `export_c`.
     """
     source = check_source_path(path)
     if precision not in PRECISIONS:
@@ -150,7 +154,7 @@ def check_source_path(path: str | Path) -> Path:
 
 def make_c_text(
     filter: AbstractFilter,
-    received: Sequence[str],
+    received: Received,
     prefix: str,
     real: Real,
     apart: bool = False,
@@ -163,7 +167,7 @@ def make_c_text(
 
     Args:
         filter: the filter.
-        received: names of z's components.
+        received: names of z's components, and which of their values are refused.
         prefix: with which all names in C begin.
         real: type of numbers.
         apart: whether prediction and correction are functions of their own, too.
@@ -187,7 +191,7 @@ def make_c_text(
     try:
         for in_loops in forms:
             with use_precision(dtype), write_short_programs(in_loops):
-                program = lower_step_to_c_functions(exported, real, prefix, apart, in_loops)
+                program = lower_step_to_c_functions(exported, real, prefix, apart, in_loops, received.leave_out)
             texts.append(generate_header_and_source(program, form))
     except ValueError as error:
         raise InputError(str(error)) from None  # a number of the filter beyond single precision

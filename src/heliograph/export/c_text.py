@@ -12,6 +12,7 @@ from heliograph.export.c_functions import (
     list_signatures,
 )
 from heliograph.export.late_measurement_window import WindowText, generate_window_code
+from heliograph.export.received_numbers import Received
 from heliograph.export.single_precision_notes import explain_ranges, explain_rounding
 from heliograph.export.step_program import CFunction, Real, StepProgram
 from heliograph.export.struct_layout import lay_out_array, lay_out_struct
@@ -34,14 +35,14 @@ class CTextOptions(NamedTuple):
     Args:
         prefix: of all names.
         real: type of numbers.
-        received: names of z's components.
+        received: names of z's components, and which of their values are refused.
         kind: description of the filter and the precision.
         late: how many steps late a measurement may be; None of a step that takes none.
     """
 
     prefix: str
     real: Real
-    received: Sequence[str]
+    received: Received
     kind: str
     late: int | None = None
 
@@ -193,7 +194,7 @@ def _generate_header_comment(program: StepProgram, form: CTextOptions, window: W
         *(explain_separate_functions(program, prefix) if len(program.parts) > 1 else []),
         *window.comment,
         "",
-        *_explain_entries("z", form.received, ranges),
+        *form.received.explain(ranges),
         *_explain_entries("u", filter.inputs, [""] * len(filter.inputs)),
         *_explain_entries("mean", filter.states, _explain_angles(filter)),
         f"covariance[{len(filter.states)} * i + j] is that of the errors of mean[i] and mean[j].",

@@ -1,18 +1,20 @@
 """A filter's step as functions of arrays that C can have: whole, or apart as its prediction and its correction."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.export.received_numbers import keep_all
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.plausibility import Judgement
 from heliograph.model.checks.plant_inputs import do_inputs_spoil
 from heliograph.model.estimate import Innovation
 from heliograph.numerics.types import PyTree
 
+Refusal: TypeAlias = Callable[[jax.Array], jax.Array]  # from z to z without the numbers that are refused
 ROUNDING = {"double": 1e-9, "float": 1e-4}  # of an expectation after many steps
 PRECISION: dict[str, type[np.floating]] = {"double": np.float64, "float": np.float32}
 
@@ -37,7 +39,9 @@ class PartOfStep(NamedTuple):
     other_results: tuple[str, ...]
 
 
-def make_parts_of_step(filter: AbstractFilter, real: str, apart: bool) -> list[PartOfStep]:
+def make_parts_of_step(
+    filter: AbstractFilter, real: str, apart: bool, leave_out: Refusal = keep_all
+) -> list[PartOfStep]:
     """Return the functions of a filter that are exported to C: its step or, if `apart`, prediction and correction.
 
     They are functions of JAX on arrays, which JAX traces and from which C is then written. Each is returned with its
@@ -48,6 +52,7 @@ def make_parts_of_step(filter: AbstractFilter, real: str, apart: bool) -> list[P
         filter: the filter.
         real: type of numbers in C, "double" or "float", by whose rounding data are judged.
         apart: whether prediction and correction are two functions; else the whole step is one.
+        leave_out: puts NaN in z in place of numbers that are refused for their value; by default none is.
     """
     # Examples: the arrays of the state, a measurement z, inputs u and the number k of a step.
     state_arrays, structure = jax.tree.flatten(filter.init())
@@ -55,7 +60,7 @@ def make_parts_of_step(filter: AbstractFilter, real: str, apart: bool) -> list[P
     # Flags: data are so far off that the estimate would lose its digits; an input has too few digits itself.
     flags = ("implausible", "spoilt")
     if not apart:
-        step = _make_step_function(filter, structure, real)
+        step = _make_step_function(filter, structure, real, leave_out)
         return [PartOfStep("step", ("z", "u"), step, examples=(state_arrays, z, u, k), other_results=flags)]
     # A robust filter also returns how much of each component it used, its weights: one correction shows whether it
     # does.
@@ -63,7 +68,7 @@ def make_parts_of_step(filter: AbstractFilter, real: str, apart: bool) -> list[P
     weights = () if innovation.weight is None else ("weight",)
     of_innovation = ("value", "nis", "arrived", *weights)
     predict = _make_prediction_function(filter, structure, real)
-    correct = _make_correction_function(filter, structure, real)
+    correct = _make_correction_function(filter, structure, real, leave_out)
     return [
         PartOfStep("predict", ("u",), predict, examples=(state_arrays, u, k), other_results=flags),
         PartOfStep(
@@ -72,10 +77,13 @@ def make_parts_of_step(filter: AbstractFilter, real: str, apart: bool) -> list[P
     ]
 
 
-def _make_step_function(filter: AbstractFilter, tree: PyTree, real: str) -> Callable[..., list[jax.Array]]:
+def _make_step_function(
+    filter: AbstractFilter, tree: PyTree, real: str, leave_out: Refusal
+) -> Callable[..., list[jax.Array]]:
     """Return the function of a whole step on arrays, from which C is written.
 
     `tree` is the structure of the filter's state, of which C holds the arrays, and `real` the type of numbers in C.
+    `leave_out` puts NaN in z in place of numbers that are refused for their value.
     """
 
     @jax.jit
@@ -85,7 +93,7 @@ def _make_step_function(filter: AbstractFilter, tree: PyTree, real: str) -> Call
         The first flag says that z or u is implausible, the second that u spoils the digits of numbers of type `real`.
         PRECISION maps this type to NumPy's. `tree` is the structure of the state.
         """
-        state = jax.tree.unflatten(tree, arrays)
+        state, z = jax.tree.unflatten(tree, arrays), leave_out(z)
         state_after, estimate, judgement, innovation = filter.judge_step(state, z, u, k)
         are_implausible = is_implausible(filter, innovation, z, real) | (judgement.input > 0)
         spoils_digits = do_inputs_spoil(filter, filter.inputs, u, k, PRECISION[real])
@@ -117,7 +125,9 @@ def _make_prediction_function(filter: AbstractFilter, tree: PyTree, real: str) -
     return predict
 
 
-def _make_correction_function(filter: AbstractFilter, tree: PyTree, real: str) -> Callable[..., list[jax.Array]]:
+def _make_correction_function(
+    filter: AbstractFilter, tree: PyTree, real: str, leave_out: Refusal
+) -> Callable[..., list[jax.Array]]:
     """Return the function of the correction by a measurement, with its innovation as further results.
 
     C code is written from this JAX function, so that it takes and returns only arrays.
@@ -126,6 +136,7 @@ def _make_correction_function(filter: AbstractFilter, tree: PyTree, real: str) -
         filter: the filter.
         tree: structure of the filter's state, which the function takes and returns as a list of arrays.
         real: type of numbers in C, "double" or "float"; a measurement is judged by their rounding.
+        leave_out: puts NaN in z in place of numbers that are refused for their value.
     """
 
     @jax.jit
@@ -135,7 +146,7 @@ def _make_correction_function(filter: AbstractFilter, tree: PyTree, real: str) -
         The flag says that z is implausible. After it come the innovation, its squared distance, how much arrived, and
         the weights if there are any.
         """
-        prior = jax.tree.unflatten(tree, arrays)
+        prior, z = jax.tree.unflatten(tree, arrays), leave_out(z)
         after, innovation = filter.correct(prior, z, k)
         # Estimates before and after z; judged by them are e' S^-1 e of the innovation, and how many numbers arrived.
         expected, estimate = filter.estimate(prior), filter.after_step(after, k)

@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.export.step_parts import PartOfStep, make_parts_of_step
+from heliograph.export.received_numbers import keep_all
+from heliograph.export.step_parts import PartOfStep, Refusal, make_parts_of_step
 from heliograph.factors.factored_gaussian import Gaussian, from_covariance
 from heliograph.factors.high_low_mean_gaussian import SplitMeanGaussian, centred_from_covariance
 from heliograph.filters.base import AbstractFilter
@@ -72,7 +73,12 @@ class StepProgram(NamedTuple):
 
 
 def lower_step_to_c_functions(
-    filter: AbstractFilter, real: Real, prefix: str, apart: bool = False, size: bool = False
+    filter: AbstractFilter,
+    real: Real,
+    prefix: str,
+    apart: bool = False,
+    size: bool = False,
+    leave_out: Refusal = keep_all,
 ) -> StepProgram:
     """Lower one step of a filter from JAX to functions of C; return them with the arrays of the state that they move.
 
@@ -82,13 +88,14 @@ def lower_step_to_c_functions(
         prefix: of the functions' names.
         apart: whether prediction and correction are two functions; else they are one.
         size: whether loops stay loops; then it is traced within `write_short_programs`.
+        leave_out: puts NaN in z in place of numbers that are refused for their value; by default none is.
 
     Raises:
         ValueError: random numbers, or operations that are not supported; with the operation and its place.
     """
     state = filter.init()
     read, of_estimate = _make_state_members(state, filter.estimate(state))
-    candidates, parts = [*read, *of_estimate], make_parts_of_step(filter, real, apart)
+    candidates, parts = [*read, *of_estimate], make_parts_of_step(filter, real, apart, leave_out)
     try:
         symmetric = _find_symmetric_arrays(parts)
         # Mean and covariance of the estimate become members of their own only where no array of the state has the same

@@ -15,7 +15,8 @@ from heliograph.model.readings.repeated_readings import Repeats, StuckLike, coun
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.check import fail, show_value
 from heliograph.numerics.module import Module
-from heliograph.numerics.types import ArrayLike, Bool, Float, Int
+from heliograph.numerics.numpy_or_jax import library
+from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int
 
 ROUNDING = 4 * float(np.finfo(np.float64).eps)  # of a product and of the factor in it, relative
 
@@ -153,7 +154,7 @@ class ReadingLimits(Module):
         `self.stuck`: the number of equal readings in a row from which a component counts as missing; None if runs are
         not counted.
         """
-        refused = self.find_refusal_reasons(z)
+        refused = np.asarray(self.find_refusal_reasons(z))
         values = np.where(refused > 0, np.nan, z)
         if self.stuck is None:
             return ScreenedReadings(values, refused, before)
@@ -162,19 +163,22 @@ class ReadingLimits(Module):
         refused = np.where(is_stuck, number_of_reason("stuck"), refused)
         return ScreenedReadings(np.where(is_stuck, np.nan, values), refused, repeats)
 
-    def find_refusal_reasons(self, z: Float[np.ndarray, "... m"]) -> Int[np.ndarray, "... m"]:
+    def find_refusal_reasons(self, z: Float[Array, "... m"]) -> Int[Array, "... m"]:
         """Return the number of the reason for which each value by itself counts as missing, or 0 if it does not.
 
         A code is a value of `self.invalid`, such as -999, that stands for no reading; it counts as a code even beyond
         the limits (`self.low`, `self.high`). NaN is missing already and has no reason.
         """
-        is_code = equals_code(z, self.invalid)
+        xp = library(z)
         is_beyond = (z < self.low) | (z > self.high)
-        return np.where(is_code, number_of_reason("code"), np.where(is_beyond, number_of_reason("limits"), 0))
+        refused_by_limits = xp.where(is_beyond, number_of_reason("limits"), 0)
+        reasons: Array = xp.where(equals_code(z, self.invalid), number_of_reason("code"), refused_by_limits)
+        return reasons
 
-    def outside(self, z: Float[np.ndarray, "... m"]) -> Bool[np.ndarray, "... m"]:
+    def outside(self, z: Float[Array, "... m"]) -> Bool[Array, "... m"]:
         """Return True for each number that by itself counts as missing; NaN is not one of them."""
-        return np.asarray(self.find_refusal_reasons(z) > 0)
+        is_outside: Array = self.find_refusal_reasons(z) > 0
+        return is_outside
 
     def describe_missing(self, z: Float[np.ndarray, " m"], refused: Int[np.ndarray, " m"], names: Sequence[str]) -> str:
         """Return in words which components of a measurement are refused, and why, or "" if none is.
@@ -197,13 +201,14 @@ class ReadingLimits(Module):
         return ", ".join(descriptions)
 
 
-def equals_code(z: ArrayLike, codes: Float[np.ndarray, " codes"]) -> Bool[np.ndarray, "..."]:
+def equals_code(z: ArrayLike, codes: Float[np.ndarray, " codes"]) -> Bool[Array, "..."]:
     """Return whether each number of z (...) is one of some codes, numbers such as -999 that stand for no reading.
 
     A number counts as the code if it differs by the rounding of a product, as where a device scales whole numbers, or
     if it is the code as single precision stores it.
     """
-    numbers = np.asarray(z, dtype=np.float64)[..., None]  # compared with all codes along a last axis
+    xp = library(z)
+    numbers = xp.asarray(z, dtype=float)[..., None]  # compared with all codes along a last axis
     if not len(codes):
         return np.zeros(numbers.shape[:-1], dtype=bool)
     # ROUNDING, SINGLE: relative rounding of a product of doubles, and of a number in single precision. All but the
@@ -211,5 +216,6 @@ def equals_code(z: ArrayLike, codes: Float[np.ndarray, " codes"]) -> Bool[np.nda
     with np.errstate(over="ignore"):
         single = codes.astype(np.float32).astype(np.float64)
     rounding = np.where(codes == np.round(codes), ROUNDING, SINGLE) * np.abs(codes)
-    is_code = (np.abs(numbers - codes) <= rounding) | (numbers == single)
-    return np.asarray(is_code.any(axis=-1))
+    is_code = (xp.abs(numbers - codes) <= rounding) | (numbers == single)
+    is_some_code: Array = is_code.any(axis=-1)
+    return is_some_code

@@ -1,15 +1,22 @@
 """A filter of a network by name: a node's, one of the centre, or one of a node between neighbours."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.fusion.network_fusion import Fusion
 from heliograph.numerics.check import fail, instance, text
 from heliograph.numerics.module import readable
+from heliograph.numerics.types import Array, Float
 from heliograph.simulation.centres.uplinks import build_uplinks
 from heliograph.simulation.mesh.node_filter import node_filter
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.network_filters import centre_filter
+from heliograph.simulation.node import Node
 
 
 @readable
@@ -21,11 +28,45 @@ class NamedFilter:
         place: name of its node, "fused" of the centre.
         filter: the filter, as it runs alone.
         received: names of the components of its measurement.
+        refusing: nodes that refuse some of what it receives, by limits or codes, and where their readings stand in it.
     """
 
     place: str
     filter: AbstractFilter
     received: tuple[str, ...]
+    refusing: tuple[tuple[slice, Node], ...] = ()
+
+    def leave_out_refused(self, z: Float[Array, " received"]) -> Float[jax.Array, " received"]:
+        """Return a measurement with NaN in place of the numbers that nodes refuse; `z`: what arrived.
+
+        Readings that are stuck stay, as one measurement does not show them.
+        """
+        left = jnp.asarray(z)
+        for rows, node in self.refusing:
+            assert node.limits is not None
+            is_refused = node.limits.outside(left[rows])
+            kept: Array = jnp.where(is_refused, jnp.nan, left[rows])
+            if node.trigger is not None:  # a refused value was sent all the same
+                kept = node.trigger.leave_out_refused(left[rows], is_refused, len(node.outputs))
+            left = left.at[rows].set(jnp.asarray(kept))
+        return left
+
+    @property
+    def refused_values(self) -> tuple[str, ...]:
+        """In words which values of each number count as not arrived, such as "-999, below 0"; "" where all count."""
+        words = [""] * len(self.received)
+        for rows, node in self.refusing:
+            limits = node.limits
+            assert limits is not None
+            for i, low, high in zip(range(len(words))[rows], limits.low, limits.high, strict=True):
+                ends = [f"below {low:g}"] * bool(low > -np.inf) + [f"above {high:g}"] * bool(high < np.inf)
+                words[i] = ", ".join([*(f"{code:g}" for code in limits.invalid), *ends])
+        return tuple(words)
+
+    @property
+    def looks_for_stuck(self) -> bool:
+        """Whether some node refuses readings that repeat for too long, which needs those before."""
+        return any(node.limits is not None and node.limits.stuck is not None for _rows, node in self.refusing)
 
 
 def find_filter_by_name(network: Network, name: str, node: str | None = None) -> NamedFilter:
@@ -62,7 +103,18 @@ def find_filter_by_name(network: Network, name: str, node: str | None = None) ->
     if name in network.meshes:
         return _find_between_neighbours(network, name, place)
     filter = network.nodes[place].filters[name]
-    return NamedFilter(place, filter, network.nodes[place].received_names[: filter.received])
+    names = network.nodes[place].received_names[: filter.received]
+    return NamedFilter(place, filter, names, _list_refusing(network, {place: range(len(names))} if names else {}))
+
+
+def _list_refusing(network: Network, rows: Mapping[str, range]) -> tuple[tuple[slice, Node], ...]:
+    """Return those of some nodes that refuse readings, each with its rows of the measurement; `rows`: by node."""
+    nodes = {name: network.nodes[name] for name in rows}
+    return tuple(
+        (slice(rows[name].start, rows[name].stop), node)
+        for name, node in nodes.items()
+        if isinstance(node, Node) and node.limits is not None
+    )
 
 
 def _find_at_centre(network: Network, name: str) -> NamedFilter:
@@ -75,7 +127,8 @@ def _find_at_centre(network: Network, name: str) -> NamedFilter:
     if isinstance(fused, AbstractFilter):
         names = [f"{node}_{number}" for node in network.names for number in network.nodes[node].received_names]
         # A central filter receives the numbers of all nodes, or no numbers (fused.received is 0).
-        return NamedFilter(FUSED, fused, tuple(names[: fused.received]))
+        refusing = _list_refusing(network, network.rows if fused.received else {})
+        return NamedFilter(FUSED, fused, tuple(names[: fused.received]), refusing)
     if not fused.rule.uses_reports:
         rule = type(fused.rule).__name__
         expected = "a central filter or a fusion by AllReports(), whose centre is a filter of what arrives"
@@ -112,8 +165,10 @@ def _find_between_neighbours(network: Network, name: str, node: str) -> NamedFil
     covariances = [f"covariance_{state}_{other}" for state in states for other in states]
     # The node's own measurement, then the message of each neighbour.
     names = list(network.nodes[node].received_names)
+    rows = {node: range(len(names))}  # where measurements stand
     neighbours = network.meshes[name].neighbours or {}
     for sender in neighbours[node]:
         measurement = network.nodes[sender].received_names
         names += [f"{sender}_{number}" for number in (*means, *covariances, *measurement)]
-    return NamedFilter(node, node_filter(network, name, node), tuple(names))
+        rows[sender] = range(len(names) - len(measurement), len(names))
+    return NamedFilter(node, node_filter(network, name, node), tuple(names), _list_refusing(network, rows))
