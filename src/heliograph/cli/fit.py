@@ -300,10 +300,13 @@ def _convert_comparison_to_json(learned: "FitResults") -> "dict[str, Json]":
     """Return how each filter predicted before and after the fit, and the laws of lost messages by node, for JSON.
 
     Args:
-        learned: results of a fit of a network to a recording: `changes` by filter, and `losses` by node.
+        learned: results of a fit of a network to a recording. `changes` has for each filter its node and name, the
+            `gain` of the log-likelihood per row (`difference` with `standard_error`, or None), and tests of its
+            innovations `before` and `after` (None where there is none). `losses` has for each node the laws of its lost
+            messages.
     """
-    # Each filter, on rows that were not fitted: gain of the log-likelihood per row; "size", the mean square of the
-    # innovations over the claimed one; and "p", the p-value of their whiteness.
+    # Each filter, on rows that were not fitted. "size": the mean square of the innovations over the claimed one
+    # (`power` of their test). "p": the p-value of their whiteness.
     filters: list[Json] = [
         {
             "node": change.node,

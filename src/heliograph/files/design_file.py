@@ -184,7 +184,8 @@ def make_designed_source(file: DesignFile, source: str, powers: Mapping[str, np.
     """Return Python source of a designed network, which loads the original from a file in its own folder.
 
     Args:
-        file: the design file.
+        file: the design file: its problem, whose criterion has horizon and period, and the reference "FILE.py:NAME" of
+            the network that it was made for.
         source: name of the file with the original network.
         powers: the designed powers by transmitter, (steps,) each: of a period or the horizon.
     """

@@ -12,7 +12,7 @@ def suggest_sources(topics: Mapping[str, TopicStatistics], names: Mapping[str, S
     """Return sources to paste into a network's file: a line for each topic that has numbers.
 
     Args:
-        topics: the topics.
+        topics: by topic what was seen of it: its fields, dates, times of logging and clock.
         names: outputs by node, and the inputs; empty if no network is known.
     """
     lines = [f"# {node}: {', '.join(outputs)}" for node, outputs in names.items()]

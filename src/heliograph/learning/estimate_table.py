@@ -263,6 +263,11 @@ class Solution:
         likelihood has fallen. A logarithm or a logit that is hardly known (by less than a factor of e) has no symmetric
         interval: it is cut out of the profile whatever the method.
 
+        `self.surface.domains.single` marks coordinates with a profile of their own, `self.active` those that are not
+        fixed, and `self.in_few_stretches` the active ones whose information is in a few stretches of the data.
+        `_find_profile_ends` returns the two values at which the profile has fallen by what `level` asks,
+        `_bootstrap_interval` quantiles of the estimate's error.
+
         Args:
             entry: the number.
             value: estimate of the number.
@@ -339,7 +344,8 @@ class Solution:
         """Return the row of a number at an end of its domain: its interval is from there to one point inside.
 
         At an end 2 * (fall of l) is chi-squared with probability 1/2 and else 0: P(fall > d) = P(chi2 > 2 d) / 2. So an
-        interval of 95 % ends where an ordinary one of 90 % = 2 * 95 % - 1 does.
+        interval of 95 % ends where an ordinary one of 90 % = 2 * 95 % - 1 does. The search for the other end of the
+        interval begins WAY_TO_END inwards, in the coordinate (a logarithm or a logit).
 
         Args:
             entry: the number.
@@ -347,7 +353,7 @@ class Solution:
             level: probability with which the interval holds the number.
         """
         assert entry.coordinate is not None
-        outward = self.top.ends[entry.coordinate]  # -1 or 1
+        outward = self.top.ends[entry.coordinate]  # -1 or 1: the end lies at minus infinity or infinity
         first = np.array([-outward * WAY_TO_END])  # distance inwards at which the search begins
         drop = find_profile_drop(2 * level - 1)
         (end,) = self._find_profile_ends(entry.coordinate, first, drop)

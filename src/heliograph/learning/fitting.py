@@ -116,6 +116,9 @@ def _maximise_forms(
 ) -> _FormMaxima:
     """Return the maximum of each form of the likelihood; the first is searched from all starts, the next from its best.
 
+    Returns the solutions, one for each form that was searched; the log-likelihoods at which the climbs of the first
+    form ended; and whether Ctrl-C stopped the search.
+
     Args:
         surfaces: the likelihood in each form: linear (of the best linear filter), conditional (sharper), or one alone.
         points: the starts (starts, p), each p free numbers as coordinates without bounds.
@@ -129,6 +132,8 @@ def _maximise_forms(
     ends = np.zeros(0)
     solutions = list[Solution]()
     for surface in surfaces:
+        # The search keeps its best point so far as `best`, and l at the end of each climb, the highest first, as
+        # `ends`.
         search = MaximumSearch(surface, _make_climb_reporter(surface, progress))
         try:
             top, stopped = search.run(points, seed), False

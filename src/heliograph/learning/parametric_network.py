@@ -174,11 +174,16 @@ class ValueReader:
     """Reader that puts values in their places: by name, and in the order of the marks where no name was given."""
 
     def __init__(self, parameters: Parameters, named: tuple[bool, ...], values: Mapping[str, object]):
-        """Store the values, and the names of the numbers that the user did not name, in the order of their marks.
+        """Store the values that are to stand in the places of a network's free numbers.
+
+        The user marks free numbers by `free(...)`, with or without a name, in the function that builds the network.
+        When that function runs again, each mark asks `answer_free` for its value: a named one by its name, one without
+        a name by its turn. So the names that were made up for these are kept in the order of the marks, as an iterator
+        that gives the next one for each mark without a name.
 
         Args:
-            parameters: all free numbers, in the order of their places.
-            named: for each, whether the user gave it a name; the others are found by their order.
+            parameters: all free numbers, in the order in which the function marks them.
+            named: for each, whether the user gave it a name.
             values: the value of each parameter, by its name.
         """
         self.values = values

@@ -83,6 +83,7 @@ def samples_to_tell(
     steps = HORIZON if inputs is None else len(np.asarray(inputs))
     u = np.zeros((steps, len(network.inputs))) if inputs is None else np.asarray(inputs, dtype=float)
     # Mean I and long-run deviation sqrt V of the log-likelihood ratio per step, where either law is true.
+    # Channels in which every gain of one of the two laws has the first, and the second.
     channels = [_replace_law(node.channel, (law_a, law_b), law) for law in (law_a, law_b)]
     means = list[float]()
     deviations = list[float]()

@@ -104,7 +104,8 @@ class MessageLayout:
 
         A bag has many messages of the same layout. Once the byte of each wanted number is known, all of them are read
         at once, without decoding one by one. The bytes are those of CDR, the encoding of ROS 2: each number is aligned
-        to its size. `self._paths`: dotted paths of the wanted numbers.
+        to its size. `self._paths`: dotted paths of the wanted numbers. Lengths of texts and lists are noted too
+        (`_note_length` returns the one that stands at a byte): only messages of the same lengths have this layout.
 
         Args:
             begin: the first byte behind the previous field.
@@ -188,6 +189,14 @@ class BatchDecoder:
 
         If it returns False, nothing was appended: the messages have no fixed layout and must be decoded one by one by
         `TopicReader.read`, which gives the same numbers in the same order.
+
+        `self.marked` counts by topic the messages that mark a field as having no value. `NodeReadings` are arrays:
+        index in the batch (`rows`), time, running count and values of each reading, and the `period` after which the
+        count begins at 0 again.
+
+        Args:
+            batch: messages of a bag: topic and type, time of logging, and bytes.
+            table: where the events go.
         """
         try:
             readings, marked = self._read_by_node(batch)
@@ -232,6 +241,7 @@ class BatchDecoder:
             # The messages of one topic and size as bytes, (messages, size).
             table = np.frombuffer(b"".join(batch[i].data for i in members), dtype=np.uint8).reshape(len(members), -1)
             connection = batch[members[0]].connection
+            # Messages of one layout: their rows in the table, and their wanted fields.
             for rows, fields in self._yield_rows_by_layout(connection, table):
                 # Fields by path (messages,), NaN where a flag says that there is no value.
                 columns, marked = blank_columns(connection.msgtype, fields, self._list_judged_paths(topic))
@@ -330,8 +340,8 @@ def _make_node_readings(
     for index, path, scale, offset in zip(indices, source.paths, source.scale, source.offset, strict=True):
         value = _compute_value_column(columns, path)
         values[:, index] = np.where(np.isfinite(value), scale * value + offset, np.nan)
-    # A time stamp of seconds and nanoseconds. 0 means that it was not set. Its seconds must have at most 32 bits, so
-    # that the nanoseconds since 1970 fit into 64.
+    # A time stamp of seconds and nanoseconds (the fields of STAMP); NONE stands for no time. 0 means that it was not
+    # set. Its seconds must have at most 32 bits, so that the nanoseconds since 1970 fit into 64.
     time = np.full(len(rows), NONE)
     if source.time is not None:
         seconds, nanoseconds = (columns[f"{source.time.path}.{field}"] for field in STAMP)
@@ -339,6 +349,7 @@ def _make_node_readings(
         if seconds.dtype.itemsize > 4 or np.any(time == 0):
             raise LayoutNotFixedError
         time += source.time.shift
+    # A running count of the sender's messages; -1 stands for none.
     if source.sequence is None:
         return NodeReadings(rows, time, sequence=np.full(len(rows), -1, dtype=np.int64), values=values, period=0)
     # A count has to be a whole number from 0 on.

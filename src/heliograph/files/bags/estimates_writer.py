@@ -110,7 +110,7 @@ def write_bag(record: Record, path: str | Path, origin: np.datetime64 | None = N
     path = Path(path)
     check_writable(path, (".mcap",))
     pose = find_pose_states(record.states) if pose is None else instance("pose", pose, Pose, "a Pose")
-    pose.places(record.states)
+    pose.places(record.states)  # raises ValueError where the pose names a state that is not there
     from rosbags.rosbag2 import StoragePlugin, Writer
 
     store = _load_ros2_message_types()
@@ -122,7 +122,8 @@ def write_bag(record: Record, path: str | Path, origin: np.datetime64 | None = N
         for name, estimate in filters.items()
         for topic, kind in _yield_topics_and_types(_make_topic_prefix(node, name), record.states, estimate.claim, pose)
     }
-    # The writer makes a folder; the file in it is complete in itself.
+    # The writer makes a folder; the file in it is complete in itself. It is moved to `partial`, which gets its final
+    # name when all is written.
     with whole_file(path) as partial, tempfile.TemporaryDirectory(dir=path.parent) as folder:
         bag = Path(folder) / "bag"
         with Writer(bag, version=9, storage_plugin=StoragePlugin.MCAP) as writer:

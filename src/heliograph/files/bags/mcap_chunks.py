@@ -47,6 +47,8 @@ def read_messages_in_order(reader: "AnyReader", connections: "Sequence[Connectio
     # One file after another, as a bag in parts was written.
     known = {(connection.topic, connection.msgtype): connection for connection in connections}
     for file in files:
+        # By number of a channel in this file its connection; and the chunks with messages of these, as they lie in the
+        # file. Messages of chunks that overlap in time are merged.
         channels = {c.id: known[c.topic, c.msgtype] for c in file.connections if (c.topic, c.msgtype) in known}
         chunks = [chunk for chunk in file.chunks if any(chunk.channel_count.get(c) for c in channels)]
         yield from _merge_chunks(file, sorted(chunks, key=attrgetter("chunk_start_offset")), channels)

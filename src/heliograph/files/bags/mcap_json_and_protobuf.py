@@ -82,6 +82,8 @@ def read_mcap_messages(path: Path, sources: TopicReader | None = None) -> Iterat
     with path.open("rb") as file:
         file.seek(len(MAGIC))
         try:
+            # Number, topic with encoding and schema, moment of logging, bytes, and the types of Protocol Buffers so
+            # far.
             for count, channel, logged, data, types in _yield_stored_messages(path, file, sources):
                 # Decode only what the sources read.
                 where = f"{path}, message {count}"

@@ -84,7 +84,8 @@ def read_bag(
             expected = f"a topic of the sources, {_join_names(sources.topics)}"
             raise fail(f"{path}", expected, f"only {_join_names(counts)}")
         _check_fields_of_sources(path, reader, sources)
-        # Decode the messages of a batch all at once if their layouts allow it, else one after another.
+        # Decode the messages of a batch all at once if their layouts allow it (else `append_events` returns False), or
+        # one after another.
         total = sum(counts[topic] for topic in used)
         done = 0
         decoder = BatchDecoder(reader, sources)

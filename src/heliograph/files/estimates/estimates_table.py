@@ -86,7 +86,11 @@ def make_column_header(name: str, unit: str | None) -> str:
 
 
 def _find_angles(record: Record) -> Angles:
-    """Return the indices of the states that are angles; () if the record does not hold its network, as `run` has it."""
+    """Return the indices of the states that are angles, by the plant of the network that was run; () if it is unknown.
+
+    `record.origin` of what `run` returns holds the network as `model`; of a record that was read from a file it is
+    None. A plant that varies over time is taken at its first step (`first`).
+    """
     network = getattr(record.origin, "model", None)
     return first(network.plant).angles if isinstance(network, Network) else ()
 

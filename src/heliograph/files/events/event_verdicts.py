@@ -97,7 +97,8 @@ def judge_events(
     newest_final = _find_newest_final_row(some, row, window)
     is_late = row <= newest_final if joint else row < newest_final
     verdicts[candidates[is_late]] = LATE
-    # Rival events are of one node in one row. Most are alone there, and stay used.
+    # Rival events are of one node in one row, as copies are; they come in order of arrival, and the first one stays.
+    # Most are alone there, and stay used.
     row_and_node = _rank_rows(some.time, some.node) if joint else identity
     has_rivals: Bool[np.ndarray, " rows_and_nodes"] = np.bincount(row_and_node, minlength=1) > 1
     contenders = np.flatnonzero(has_rivals[row_and_node] & (row >= newest_final))

@@ -186,8 +186,14 @@ class FrameReader:
     def _decode_signals(self, frame: "Message", description: "Description", where: str) -> dict[str, Any] | InputError:
         """Return {name of a signal: its value, or None if the frame has none}, or the error why it cannot be read.
 
-        A value that is a word, such as "not available", is None, too. Frames of other lengths than described, and such
-        words, are counted. `description`: the frame's message as the database has it. `where`: for errors.
+        The error is returned, not raised, since only this frame is refused and reading goes on. A value that stands for
+        a word, such as "not available", becomes None, too. Frames of other lengths than described, and such words, are
+        counted for notes to the user.
+
+        Args:
+            frame: the frame, as python-can reads it.
+            description: the frame's message as the database has it; `length` is its number of bytes.
+            where: place of the frame, for errors.
         """
         size, length = len(frame.data), description.length
         if size < length:
@@ -201,6 +207,7 @@ class FrameReader:
             self._longer[description.name] += 1
         # A multiplexed message has only some of its signals in each frame; the others are None.
         signals: dict[str, Any] = dict.fromkeys(signal.name for signal in description.signals) | decoded
+        # `self._words`: for each signal of a message {number: the word that it stands for}.
         for name, words in self._words[description.name].items():
             if words and (word := words.get(signals[name])) is not None:
                 self._came_as_words[f"{description.name}.{name} {word!r}"] += 1

@@ -32,7 +32,8 @@ def open_logs(path: Path, sources: LogSources, wanted: Wanted) -> Log:
     logs = [open_log(part, sources, wanted) for part in list_logs(path) or [path]]
     if len(logs) == 1:
         return logs[0]
-    # A log's notes (lines on what was left out) are complete once all its messages have been read.
+    # One `Log` of all: units and bits of the signals and kinds of the messages, by message, then the messages
+    # themselves. A log's notes (lines on what was left out) are complete once all its messages have been read.
     notes = list[str]()
 
     def read_one_after_another() -> Iterator[FileMessage | InputError]:

@@ -49,7 +49,8 @@ def open_mdf(path: Path, sources: LogSources, wanted: Wanted) -> Log:
         raise
     except Exception as error:  # whatever a damaged file makes a reader do
         raise fail(str(path), "an MDF4 file", error_text(error)) from None
-    return Log(units, dict.fromkeys(names, "MDF4"), merge_series(path, begin, series), [])
+    messages = merge_series(path, begin, series)  # of all groups, in order of time
+    return Log(units, kinds=dict.fromkeys(names, "MDF4"), messages=messages, notes=[])
 
 
 def _name_groups(file: "MDF") -> list[str]:

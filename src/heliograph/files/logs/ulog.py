@@ -58,7 +58,8 @@ def open_ulog(path: Path, sources: LogSources, wanted: Wanted) -> Log:
         notes.append(f"{path}: the device lost {len(file.dropouts)} times what it should have logged")
     if file.file_corruption:
         notes.append(f"{path}: damaged; what could be read is used")
-    return Log(units, dict.fromkeys(topics, "ULog"), merge_series(path, begin, series), notes)
+    messages = merge_series(path, begin, series)  # of all topics, in order of time
+    return Log(units, kinds=dict.fromkeys(topics, "ULog"), messages=messages, notes=notes)
 
 
 def _find_start_date(file: "ULog") -> float:

@@ -78,10 +78,11 @@ def read_messages(
 
     Args:
         path: the bag, the file or the folder, or the URL of a store.
-        network: the network.
-        sources: sources by topic, as `json_field` makes them; None for messages in our own form.
+        network: the network, which names the nodes and the numbers that each receives.
+        sources: sources by topic, as `json_field` makes them: which field of a message is which number of which node;
+            for a vehicle's log the `LogSources`. None for messages in our own form.
         progress: called with the numbers of messages read and to be read (default none).
-        strict: whether the first message that cannot be read is an error (default False).
+        strict: whether the first message that cannot be read is an error (default False: it is refused alone).
         ignore_unknown: whether columns that the network does not know are left out, of messages in our own form
             (default False: they are refused, since they may be misspelt).
 

@@ -231,7 +231,8 @@ class RowReader:
         """Return rows in the order of their times as a recording; refused rows become steps, if every row is a step.
 
         Args:
-            cells: the rows.
+            cells: the rows that could be read: their numbers in the table, times, and columns of measurements, inputs
+                and true states.
             before: the last row of the block before, None for the first block. Missing times and inputs of these rows
                 are filled from it.
 
@@ -243,7 +244,8 @@ class RowReader:
         if before is not None:
             begin, first_number = 1, int(before.numbers[0])
             cells = join_recording_rows([before, cells])
-        # Rows that were refused get a time between their neighbours and NaN as measurements.
+        # Rows that were refused get a time between their neighbours and NaN as measurements: `fill` sets a column's
+        # values into the rows that were read, and NaN into the others.
         rows = insert_missing_rows(cells.numbers, self.network, first_number)
         time = rows.fill_times(cells.time)
         u = _make_inputs(self.network, cells.inputs, time, rows, self.source)

@@ -163,7 +163,9 @@ def _read_times(columns: Mapping[str, np.ndarray], name: str, refusals: RowRefus
 def _read_column_without_gaps(columns: Mapping[str, np.ndarray], name: str, refusals: RowRefusals) -> np.ndarray:
     """Return the numbers of a column that may have no gaps; rows without a finite number are refused.
 
-    Integers stay integers, since they may be too large for an exact double.
+    Integers stay integers, since they may be too large for an exact double; a missing one stands as the constant
+    MISSING, which `find_missing` knows. `refuse` notes an error for each of these rows, which names the cell as
+    `_describe_cell` shows it, or raises the first one where reading is strict.
     """
     values = columns[name] if columns[name].dtype.kind == "i" else _read_numbers(columns, name, refusals.source)
     refusals.refuse(find_missing(values) | ~np.isfinite(values), name, "a finite number", _describe_cell(values))

@@ -66,7 +66,7 @@ def order_rows(cells: RecordingRows, network: Network, source: str) -> tuple[Rec
         is_refused = find_unset_stamps(stamps, YEAR if dated else YEAR / SECOND)
         expected = "a time that was set, near the others"
     else:
-        is_refused = find_out_of_order(stamps)
+        is_refused = find_out_of_order(stamps)  # as few as possible, so that the others do not go backwards
         expected = "a time that does not go backwards"
     if TIME_STEP in cells.inputs or np.mean(is_refused) >= MOST_OUT:
         return cells, [], 0

@@ -55,7 +55,8 @@ class TopicReader:
     def __init__(self, table: object, network: Network, others: Collection[str] = ()):
         """Check the sources by topic (fields that are measurements) against a network; `others`: nodes left out."""
         self.network, self.others = network, others
-        # What is counted and noted of the messages that come.
+        # What is counted and noted of the messages that come, for notes to the user: `senders`, to find several that
+        # share one count; `clocks`, to compare the clocks of topics.
         self.senders, self.clocks = SenderCounter(), TopicClocks()
         self.unknown = Counter[str]()  # messages of topics that are not in the table, by topic
         self.stored = 0  # a broker's stored messages without a time: they arrive on subscribing, so have no date
@@ -188,6 +189,7 @@ class TopicReader:
             reading: what came.
             arrival: when it arrived, in nanoseconds since 1970; None if that is not known.
         """
+        # `_last` has by plant and node the last reading, its moment, and whether its count has ever changed.
         moment = reading.time if arrival is None else arrival
         has_no_seconds = self.time_counts_steps and self.step_seconds is None
         if reading.sequence is None or reading.time is None or moment is None or has_no_seconds:
@@ -236,7 +238,8 @@ class TopicReader:
         # A message with a count may lack values: it measured nothing.
         has_count = sequence is not None and not is_count_absent
         values = np.full(len(self.names[node]), np.nan)
-        # Each value in the output's unit: scale value + offset.
+        # Each value in the output's unit: scale value + offset. `found` and `absent` note which fields came at all and
+        # which did not: one that never comes is misspelt.
         parts = zip(mapped.indices_by_node[node], source.paths, source.scale, source.offset, strict=True)
         for index, path, scale, offset in parts:
             try:

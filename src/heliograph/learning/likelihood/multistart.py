@@ -88,6 +88,8 @@ class MaximumSearch:
             starts: where to begin (starts, p); from a single one there is a single climb.
             seed: seed of the second round.
         """
+        # `_prove_maximum` takes the highest end of the climbs, puts numbers at ends of their domains that belong there,
+        # and climbs on from saddles until the Hessian shows a maximum.
         no_ends = np.zeros(starts.shape[1])  # no coordinate is held at an end of its domain
         climbed = self._climb_by_first_rows(starts, no_ends, own=0)
         top = self._prove_maximum(climbed)

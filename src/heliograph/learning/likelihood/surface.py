@@ -182,7 +182,8 @@ class LikelihoodSurface:
 
         l is the log-likelihood of the free numbers x (p,). A negative least curvature means that x is no maximum but a
         saddle, from which the search goes on along the direction. Only coordinates with `active` (p,) true count, along
-        directions that the data identify, and lengths are in standard errors.
+        directions that the data identify, and lengths are in standard errors. The gain is infinite if the Hessian is
+        not finite, and 0 if the data identify no direction.
         """
         evaluation = self.evaluations(x[None])
         coordinates = np.flatnonzero(active)
@@ -224,6 +225,9 @@ class LikelihoodSurface:
         The profile at a value is l with all other active coordinates at their best. Its fall is f = sqrt(2 (top - l)),
         linear in the distance t from the maximum where l is quadratic: so t is found by Newton's method for
         f(t) = sqrt(2 drop), kept between a distance known to be inside and one known to be outside.
+
+        At most MOST_CUTS distances are tried. An end that is not found by then is the last one tried; one that lies
+        beyond `furthest` is infinite.
 
         Args:
             x: the maximum (p,).

@@ -65,7 +65,7 @@ def trust_region_step(
     stays = unit == 0
     d = np.where(free | stays, 1.0, np.maximum(1.0, radius[:, None] * unit / LONGEST_LOGARITHM))
     g = np.nan_to_num(gradient) * unit
-    b = _scale_model(model, information, unit)
+    b = _scale_model(model, information, unit)  # u B u, or u I u where B is not finite or huge
     b = (b + b.swapaxes(1, 2)) / 2 + flat @ flat.swapaxes(1, 2) + np.eye(len(free)) * stays[:, :, None]
     # The step on or within the radius; one that is up to a hundredth longer is shortened to it.
     step = _find_step_within(radius, g, b, d)
@@ -110,6 +110,7 @@ def _find_step_within(radius: np.ndarray, g: np.ndarray, b: np.ndarray, d: np.nd
         beyond = length > 1.01 * radius
         if not beyond.any():
             break
+        # Newton's step for 1 / |D p| - 1 / radius: |D p|^2 / slope (|D p| - radius) / radius.
         slope = np.sum(d * d * step * _solve_shifted(b, shift, d, d * d * step), axis=1)  # -|D p| d|D p| / ds
         newton = length**2 / np.where(beyond, slope, 1.0) * (length - radius) / radius
         shift = np.where(beyond, shift + newton, shift)

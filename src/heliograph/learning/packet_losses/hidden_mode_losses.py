@@ -68,6 +68,7 @@ class HiddenModeLosses(AbstractLossLaw):
             value_of_ends, gradient_of_ends = ends.likelihood(x)
             return value - value_of_ends, gradient - gradient_of_ends
 
+        # The maximum, then each of the four shares with its interval.
         top, value = maximise_over_shares(likelihood, [*STARTS])
         good, bad, fails, recovers = estimate_shares(likelihood, top, value, intervals)
         if good.estimate > bad.estimate:  # the good mode is the one that loses less
@@ -171,6 +172,8 @@ class FateRuns:
         Complex shares give derivatives: the imaginary part of l(x + i h) is h dl/dx for a tiny h.
 
         `shares`: (sets, 4), in each the losses when good and when bad, and the probabilities to fail and to recover.
+        `self.kind`: the fate of each run in turn, START where a stretch begins. `self.runs_by_kind`: for each kind the
+        indices of its runs, their distinct lengths, and which of these each run has.
         """
         good, bad, fails, recovers = shares.T
         ones = np.ones_like(good)

@@ -180,7 +180,7 @@ class MarkovLosses(AbstractLossLaw):
             # divided out below. `np.add.at` counts a past each time that it comes.
             counted = (length == order) & (~np.isnan(stretch) if order == 1 else find_trials(stretch))
             np.add.at(counts, (past[counted], fill_ends(stretch)[counted].astype(int)), 1.0)
-        # Lengths of the stretches, for the division by P(the last packet arrives).
+        # Lengths of the stretches that were cut where packets arrived, for the division by P(the last packet arrives).
         spans = _measure_spans(stretches)
         return _condition_on_ends(counts, spans, intervals) if order == 1 and len(spans) else MarkovLosses(counts)
 

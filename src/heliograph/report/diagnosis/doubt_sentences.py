@@ -101,7 +101,9 @@ def say_how_to_refuse_repeats(held: StuckValue, refused: bool) -> str:
 def say_declared_variances_are_off(judgements: Sequence[DeclaredJudgement], unit: str) -> list[str]:
     """Return the sentences on noise variances that messages report; with several links, their outputs are named.
 
-    `judgements` compare the reported variances with the innovations, one for each link. `unit`: of the plant's time.
+    A link may report the variance of its noise with each message. `judgements`: for each such link, the comparison of
+    these variances with the innovations; its `sentences` say what is wrong with them, none where nothing is, and
+    `outputs` has the names of what the link carries. `unit`: of the plant's time, for the memory of a bias.
     """
     several = len(judgements) > 1
     return [
