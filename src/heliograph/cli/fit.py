@@ -98,6 +98,8 @@ def fit_and_judge(
 ) -> "FitResults":
     """Fit the free numbers to the earlier rows; return the fit with what the filters make of the later (held-out) ones.
 
+    `stop.run_unless_stopped(work)` returns what work returns, or None after a signal.
+
     Args:
         network: the network as the user names it, FILE or FILE:NAME.
         measurements: where the data are.

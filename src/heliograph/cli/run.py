@@ -285,6 +285,8 @@ def _write_report(name: str, network: "Network", plants: "Sequence[FilteredPlant
 
     A record holds the measurements and estimates of a run, and a diagnosis says how plausible both are. `plants` are
     the plants with their records and forecasts, `name` is that of the network, and `report` the folder to write.
+
+    A report of one plant is a page; of several there is an overview, and a folder for each plant.
     """
     from dataclasses import replace
 

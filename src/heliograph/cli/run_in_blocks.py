@@ -129,6 +129,9 @@ def filter_in_blocks(
 ) -> PrintedLines:
     """Filter the rows of a table and write the estimates, block by block; return what is to be said of it.
 
+    `RecordingBlocks` yields parts of the table as recordings; after the last it has counts and reasons of refused rows,
+    notes and doubts. A `RowsNotInBlocksError` says that only all rows together show their order.
+
     Args:
         network: the network.
         path: the table, CSV or Parquet.

@@ -117,6 +117,9 @@ class ServeOptions:
     def _make_state_topics(self) -> "StateTopics | None":
         """Return the topics under which single states are published, by --states and --discovery; None without.
 
+        `self.states`: the broker's URL with the first part of the topics; `self.discovery`: the topic under which home
+        automation looks for devices.
+
         Raises:
             ValueError: an address that is none of MQTT; discovery without one, or a topic that is none.
         """

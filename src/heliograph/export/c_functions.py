@@ -65,6 +65,9 @@ def generate_c_functions(program: StepProgram, prefix: str, real: Real) -> list[
     set), `predict`, `correct`, and `step`, which calls the two. Each function of C returns 0, or the number of a reason
     to refuse its arguments, and writes the state only if it refuses nothing.
 
+    A part is the whole step, or prediction and correction (numbers 0 and 1). `_join_function` puts a head and the lines
+    of its body together.
+
     Args:
         program: the filter's step, translated to statements of C, with the members of its state.
         prefix: with which all names in C begin.

@@ -58,6 +58,9 @@ class CText(NamedTuple):
 def generate_header_and_source(program: StepProgram, form: CTextOptions) -> CText:
     """Return header and source of a step in C, with its counts of operations and bytes.
 
+    A field of the state's struct is a C type, a name and a length; `lay_out_array` and `lay_out_struct` return size and
+    alignment in bytes.
+
     Args:
         program: the filter's step, as functions of C, and the arrays of the state (`members`).
         form: the prefix of all names, the C type of numbers (`real`), the names of z's components, a description, and
@@ -168,6 +171,9 @@ def find_claim_at_precision(filter: AbstractFilter, real: Real) -> Claim:
 
 def _generate_header_comment(program: StepProgram, form: CTextOptions, window: WindowText) -> str:
     """Return the comment at the head of the header: how to call the functions, and what the arrays hold.
+
+    Lines on functions of their own are there if the program has several parts. MADE marks a header that was exported,
+    by which it may be overwritten later.
 
     Args:
         program: the filter's step, as functions of C.

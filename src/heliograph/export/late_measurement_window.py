@@ -57,7 +57,10 @@ def check_and_count_window_steps(filter: AbstractFilter, steps: object) -> int:
     """Return how many steps late a measurement may be, checked.
 
     In continuous time a late measurement splits the interval between two steps. So nothing of the model may count
-    steps, and the prediction over an interval should be that over its two parts: warn if it is not.
+    steps, and the prediction over an interval should be that over its two parts: warn if it is not. `filter.assumed`
+    are plant, sensor, channel and trigger that the filter takes for true, None if it names none;
+    `find_indivisible_part` names a part that counts steps, and `explain_uneven_prediction` says why a prediction over
+    an interval differs from that over its parts. Both return nothing where all is well.
 
     Raises:
         ValueError: no positive whole number; a filter in continuous time with a part of its model that counts steps.

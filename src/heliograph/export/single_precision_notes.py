@@ -19,7 +19,7 @@ def explain_ranges(filter: AbstractFilter) -> list[str]:
     """Return a note for each component of z: up to which size rounding is small beside its noise; "" if unknown.
 
     HALF_UNIT is the largest relative error of rounding to single precision. SHARE is the largest share of the noise's
-    deviation that rounding may have.
+    deviation that rounding may have. So the largest size is SHARE (0.01) deviation / HALF_UNIT (2^-24).
     """
     deviations = _find_noise_deviations(filter)
     if deviations is None:

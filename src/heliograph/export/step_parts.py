@@ -76,6 +76,8 @@ def _make_step_function(filter: AbstractFilter, tree: PyTree, real: str) -> Call
     """Return the function of a whole step on arrays, from which C is written.
 
     `tree` is the structure of the filter's state, of which C holds the arrays, and `real` the type of numbers in C.
+    `judge_step` is the filter's step that also judges its data: `judgement.input` is above 0 if the inputs are
+    implausible.
     """
 
     @jax.jit
@@ -98,6 +100,7 @@ def _make_prediction_function(filter: AbstractFilter, tree: PyTree, real: str) -
     """Return the function of the prediction alone on arrays, from which C is written.
 
     `tree` is the structure of the filter's state, of which C holds the arrays, and `real` the type of numbers in C.
+    `judgement.input` is above 0 if the inputs are implausible.
     """
 
     @jax.jit

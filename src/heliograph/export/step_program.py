@@ -76,6 +76,9 @@ def lower_step_to_c_functions(
 ) -> StepProgram:
     """Lower one step of a filter from JAX to functions of C; return them with the arrays of the state that they move.
 
+    `_lower_part_to_c` translates a part; `_find_same_result` returns the first array of the state that always equals a
+    given one. `_find_symmetric_arrays` says of which arrays one triangle is enough.
+
     Args:
         filter: the filter.
         real: type of numbers in C.

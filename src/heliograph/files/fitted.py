@@ -77,7 +77,7 @@ def write_fitted(content: Mapping[str, object], reference: str, measurements: st
         target: the folder's later name. The path to the network's file is relative to it.
     """
     (folder / FITTED).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-    path, colon, name = _split_reference(reference)
+    path, colon, name = _split_reference(reference)  # path is None for MODULE:NAME
     if path is None:
         source = repr(reference)
     else:

@@ -71,7 +71,8 @@ class TopicStatistics:
 
         It is the first date field whose values differ, or else the first date field. Without dates it is the first
         clock that never goes back. `self.dates` maps a date field to its times, in nanoseconds since 1970, and to how
-        many seconds later messages came.
+        many seconds later messages came. `self.late`: how late messages came after this time; `self.logged`: when they
+        were logged, by this time if nothing else says it.
         """
         if self.time is not None:
             return
@@ -132,6 +133,9 @@ def note_message(
     topics: dict[str, TopicStatistics], name: str, content: object, kind: str, arrival: int | None
 ) -> None:
     """Count a message under its topic; note its numeric fields, and its dates with how late the message came.
+
+    `_yield_leaves` yields (dotted path, value) of all fields. A number that may be a clock from its own start is kept
+    if no arrival is known.
 
     Args:
         topics: the topics by name; a new one is added.

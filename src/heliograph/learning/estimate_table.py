@@ -115,7 +115,9 @@ class Solution:
     def hessian(self) -> Float[np.ndarray, "r r"]:
         """Hessian of -l along the r identified directions, B' H B with B = `basis`.
 
-        If it is not positive definite, as by rounding, the Gauss-Newton information takes its place.
+        If it is not positive definite, as by rounding, the Gauss-Newton information takes its place. `basis` (active,
+        r) has these directions as columns, in the coordinates of `active` numbers, those not at an end of their domain;
+        `_project_on_identified` multiplies by it from both sides.
         """
         hessian_of_active = self.surface.hessian(self.top.x, self.active)[np.ix_(self.active, self.active)]
         hessian = self._project_on_identified(hessian_of_active)
@@ -141,7 +143,8 @@ class Solution:
     def in_few_stretches(self) -> Bool[np.ndarray, " active"]:
         """Which active coordinates (active,) are real numbers that only a few stretches of the data inform of.
 
-        The scores of such a number, as of a bias after a rare event, do not tell how far its estimate varies.
+        The scores of such a number, as of a bias after a rare event, do not tell how far its estimate varies. Asked is
+        only where the data identify all directions: `rank.flat` (p, directions) has those that they do not.
         """
         free = np.flatnonzero(self.active & self.surface.domains.free)
         in_few_stretches = np.zeros(len(self.active), dtype=bool)
@@ -154,7 +157,8 @@ class Solution:
 
         It is H^-1 J H^-1, with H the Hessian of -l and J the covariance of the sum of scores (gradients of l by row),
         estimated by `method`. Numbers whose information is in a few stretches of the data (`in_few_stretches`) have the
-        model's J.
+        model's J. `basis` (active, r): the identified directions; `scores` are cut to them, and the result brought
+        back.
         """
         scores = self.scores
         by_model = np.zeros((len(self.in_few_stretches), len(self.in_few_stretches)))  # the part of J by the model
@@ -191,6 +195,9 @@ class Solution:
         """Return a line for each number: its estimate, and an interval by the expected information at the maximum.
 
         A printed fit shows it where `rows` were not asked for: it needs no derivatives by row.
+
+        `active`: coordinates that are not at an end of their domain. `slopes`: derivatives of each table entry's
+        logarithm or logit by them (entries, active).
         """
         active, values = self.active, self.parameters.entries_at(self.x)
         # A number's variance is g' I^-1 g, with its derivative g, unconstrained too, by the active coordinates.
@@ -226,6 +233,9 @@ class Solution:
 
     def _make_rows(self, method: Method, level: float) -> tuple[Row, ...]:
         """Return a row for each number of the table: at a boundary, not identified, or with an interval by `method`.
+
+        `active` marks coordinates that are not at an end of their domain; `identifies` says whether the data tell a
+        number with these slopes.
 
         Args:
             method: how intervals are computed, as of `Fit.rows`.
@@ -321,7 +331,8 @@ class Solution:
         """Return whether the data identify a function f of the numbers: f does not change where l does not (ridges).
 
         `slopes`: df/dx by the active coordinates x. Its component along ridges (`rank.flat`) is at most
-        LARGEST_SHARE_ALONG_RIDGE |df/dx|.
+        LARGEST_SHARE_ALONG_RIDGE |df/dx|. `rank.unit`: standard errors of the coordinates; columns of `rank.flat`:
+        ridges, in units of these.
         """
         scaled_slopes = self.rank.unit * slopes  # in units of each coordinate's standard error
         size = np.linalg.norm(scaled_slopes)
@@ -330,7 +341,8 @@ class Solution:
     def _bootstrap_interval(self, slopes: np.ndarray, level: float) -> np.ndarray:
         """Return both ends of an interval, relative to the estimate, by a bootstrap of blocks of scores.
 
-        A sum of scores moves the maximum by H^-1 times it.
+        A sum of scores moves the maximum by H^-1 times it. `basis`: the r identified directions (active, r), along
+        which H is taken. The draws are sums of blocks of rows' scores, less their mean (draws, r).
 
         Args:
             slopes: derivatives of the number's unconstrained coordinate by the active coordinates (active,).
@@ -372,7 +384,9 @@ class Solution:
     def _find_profile_ends(self, coordinate: int, first: np.ndarray, drop: float) -> Float[np.ndarray, " sides"]:
         """Return where the profile likelihood of a coordinate is `drop` nats below its maximum, for each side searched.
 
-        `first` (sides,): signed distances from the maximum at which searches begin; they end at `furthest`.
+        `first` (sides,): signed distances from the maximum at which searches begin; they end at `furthest`. A logarithm
+        or logit is followed for FURTHEST_LOGARITHM (40) steps, a real number for FURTHEST_REAL (1000) times the first
+        distance; an end not found by then is infinite.
         """
         furthest = FURTHEST_REAL * np.abs(first).max() if self.surface.domains.free[coordinate] else FURTHEST_LOGARITHM
         return self.surface.find_profile_crossings(

@@ -208,7 +208,8 @@ def _choose_starts(surface: LikelihoodSurface, count: int, seed: int) -> Float[n
 def _require_information_on_each_number(surface: LikelihoodSurface, points: np.ndarray) -> None:
     """Raise ValueError for a free number of which the data have no information, or no derivative, at all points.
 
-    The estimate of such a number could be anything.
+    The estimate of such a number could be anything. Each number of `own` is the information of one start on this number
+    alone, (starts,).
 
     Args:
         surface: the likelihood over the free numbers.

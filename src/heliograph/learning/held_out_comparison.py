@@ -181,7 +181,7 @@ def _predict_rows(filter: AbstractFilter, z: np.ndarray, u: np.ndarray, cut: int
 
     They are each row's log density, its innovation divided by the predicted deviation, which is white noise if the
     filter is right, and a test of these for correlation over at most LAGS rows. The test is None if there are too few
-    rows.
+    rows. LAGS is 10; `score_innovations` returns both of all rows.
     """
     log_density, whitened = (np.asarray(values)[cut:] for values in score_innovations(filter, z, u))
     lags = min(LAGS, len(whitened) // 10)

@@ -43,7 +43,8 @@ def group_tested_filters_by_figure(health: Health) -> dict[str, list[FilterHealt
 def draw_innovations(health: Health, tested: Sequence[FilterHealth]) -> Figure:
     """Draw the innovations of each filter in `tested` over time, in claimed deviations, a panel each.
 
-    Lines at ±BAND (2) deviations show where 95 of 100 should lie.
+    Lines at ±BAND (2) deviations show where 95 of 100 should lie. `judged.white` are the innovations (time, outputs);
+    `names` has by node the names of its outputs.
     """
     figure, grid = make_stacked_panels(len(tested), height=1.5, margin=0.6)
     names = _name_components(health)
@@ -125,7 +126,11 @@ def make_innovations_section(health: Health, drawings: Mapping[str, bytes]) -> S
 
 
 def _make_tests_table(health: Health) -> Table:
-    """Return the table of tests of innovations: size, correlation and p-value of each filter, the fused ones first."""
+    """Return the table of tests of innovations: size, correlation and p-value of each filter, the fused ones first.
+
+    `test` of a filter is None with too few rows, or without a claim: dashes. `power` is the mean square over the claim;
+    correlation and standard error are by lag, the first lag at [0].
+    """
     rows = []
     for judged in _sort_fused_first(health.filters):
         cells = ["–", "–", "–"]
@@ -166,7 +171,8 @@ def _make_outputs_table(health: Health) -> list[Table]:
 def _make_output_cells(output: OutputHealth) -> list[str]:
     """Return an output's row of the table: name, received, down-weighted, bias, size, remarks.
 
-    Bias and size have two digits of their standard errors.
+    Bias and size have two digits of their standard errors. `summary` has counts, bias and share of values that the
+    filter weighted down, with intervals; `judged.held` is the run of a stuck value, None if there is none.
     """
     judged, summary = output.judged, output.judged.summary
     doubted = "–"

@@ -77,7 +77,11 @@ def write_results(
 
 
 def write_into_folder(results: ResultsContent, folder: Path) -> None:
-    """Write figures, report, data and summary into an existing folder."""
+    """Write figures, report, data and summary into an existing folder.
+
+    `results` has figures by file name, `page` (a function from all figures as SVG to the page), `write_data` (writes
+    other files into the folder) and `summary`, all numbers for JSON.
+    """
     # The SVG pictures come first: drawing them lays the figures out, and the PNG files use this layout.
     from heliograph.report.figures import png, svg
 

@@ -144,7 +144,8 @@ class MessageLayout:
         """Note the bytes of the wanted numbers among `count` numbers in a row; return the byte after the last.
 
         `names` holds the paths of the numbers. `kind` is their type, such as "uint16", whose size in bytes is in
-        NUMBERS. Every number begins at a multiple of its size.
+        NUMBERS. Every number begins at a multiple of its size. `self._paths`: paths of the wanted numbers.
+        `self.fields`: {path: (first byte, type)}. LayoutNotFixedError: the type has no fixed size.
         """
         size = NUMBERS.get(kind)
         if size is None:
@@ -266,7 +267,9 @@ class BatchDecoder:
     ) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
         """Yield (rows of `table` of one layout, {path: wanted field (rows,)}) until all messages are covered.
 
-        Layouts are kept for later calls, since most messages of a topic have one of a few layouts.
+        Layouts are kept for later calls, since most messages of a topic have one of a few layouts. `self._layouts` has
+        by topic and size the layouts so far; `fits` marks the messages (rows of the table) of one layout, and
+        `read_columns` reads their fields.
 
         Args:
             connection: topic and type of the messages.
@@ -299,6 +302,9 @@ class NodeReadings(NamedTuple):
 
 def _list_paths_of_numbers(source: Source) -> list[str]:
     """Return the dotted paths of the numbers that a source reads: values, both parts of a stamp, and a running count.
+
+    A path is a text, or a value computed from several fields, whose paths `_list_component_paths` lists. STAMP: the
+    names of seconds and nanoseconds.
 
     Raises:
         LayoutNotFixedError: the source's messages must be decoded one by one. Its plant or node stands in the message,
@@ -388,5 +394,7 @@ def _align_to_size(begin: int, size: int) -> int:
     """Return the first byte from `begin` on at which a number of `size` bytes may stand.
 
     CDR aligns a number to a multiple of its size, counted from behind the head of four bytes.
+
+    So begin - 4 is rounded up to a multiple of `size`, and 4 added again. `begin` is 4 or more.
     """
     return 4 + -(-(begin - 4) // size) * size

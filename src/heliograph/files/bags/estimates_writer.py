@@ -175,7 +175,7 @@ def _yield_topics_and_types(
     """Yield (topic, message type) for each part of one filter's estimates: odometry, states and their deviations.
 
     There is odometry if a state is an axis of the pose or twist. There are standard deviations (sd) if the filter
-    claims a covariance.
+    claims a covariance. ODOMETRY and NUMBER are names of message types of ROS.
     """
     axes_of_pose, axes_of_twist = pose.places(states)
     if any(state is not None for state in (*axes_of_pose, *axes_of_twist)):

@@ -115,6 +115,10 @@ class _StoredMessage(NamedTuple):
 def _yield_stored_messages(path: Path, file: BinaryIO, sources: TopicReader | None) -> Iterator[_StoredMessage]:
     """Yield the messages of an open file in its order; schemas and channels stand before the messages that need them.
 
+    `_read_records` yields kind and content of each record. A channel is a topic with its encoding and the number of its
+    schema; a message record begins with a head (HEADER) that has the channel's number and the moment of logging.
+    `types`: {number of a schema: its message type}, as far as they have come.
+
     Raises:
         ValueError: a topic of the sources in an encoding that is not read.
         Exception: whatever damage leads to.

@@ -204,7 +204,8 @@ def read_raw_messages(path: Path, reader: "AnyReader", topics: list[str]) -> Ite
 def group_into_batches(messages: Iterator[RawMessage]) -> Iterator[list[RawMessage]]:
     """Yield messages in lists of at most OFTEN messages, which end once they have LARGE bytes.
 
-    If reading fails, the messages before the failure are yielded first, and the error is raised then.
+    If reading fails, the messages before the failure are yielded first, and the error is raised then. A batch is
+    decoded all at once; its size bounds the memory.
     """
     batch, size, failure = list[RawMessage](), 0, None
     while failure is None:
@@ -296,7 +297,11 @@ def format_moment(nanoseconds: int) -> str:
 
 
 def _check_fields_of_sources(path: Path, reader: "AnyReader", sources: TopicReader) -> None:
-    """Raise ValueError if a source maps a field that the message type of its topic does not have."""
+    """Raise ValueError if a source maps a field that the message type of its topic does not have.
+
+    A connection is a topic of the bag with its message type. `list_fields` yields (path, basic type) of the type's
+    fields; `_has_field` looks a source's path up among them.
+    """
     for connection in reader.connections:
         what = f"{path}, {connection.topic}"
         fields = dict(list_fields(reader, connection.msgtype))

@@ -140,7 +140,9 @@ def _make_predicted_columns(
 ) -> list[tuple[str, np.ndarray]]:
     """Return columns (header, values) of predictions of each row: means, and standard deviations if they are claimed.
 
-    Those of states are named as the states, those of sensors' outputs begin with "output.".
+    Those of states are named as the states, those of sensors' outputs begin with "output.". `make_column_header` puts
+    the unit behind a name. A prediction has names, means and deviations (rows, numbers), and a claim, "none" without
+    deviations.
     """
     # (beginning of the names, predicted quantities, {name: unit})
     parts = [("", predicted.states, record.units)]

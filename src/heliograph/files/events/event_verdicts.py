@@ -43,6 +43,9 @@ def sort_by_arrival(columns: Mapping[str, NodeEvents]) -> EventsByArrival:
 
     Events without a running count get one: how many events of the same node and time arrived before.
 
+    `lexsort` sorts by the last key first: by arrival, then in the order in which a node's events came. `event_index`
+    numbers the events of one node.
+
     Args:
         columns: the events of the inputs, whose node number is -1, and then of each node, numbered from 0.
 
@@ -185,7 +188,8 @@ def _find_newest_final_row(
 ) -> Int[np.ndarray, " events"]:
     """Return for each event the rank of the newest row that is final when the event arrives, -1 if there is none.
 
-    A row of time t is final once some event arrives later than t + window. Rows are ranked by time.
+    A row of time t is final once some event arrives later than t + window. Rows are ranked by time. `watermark` is how
+    far time has certainly got at each arrival.
 
     Args:
         events: the events, in order of arrival.

@@ -30,6 +30,9 @@ def open_frame_log(path: Path, sources: LogSources, wanted: Wanted) -> Log:
 
     Without a database, messages are named by their identifiers and have no signals.
 
+    A `Log` has units, kinds and bits of the signals by message, the messages, and notes on what was left out, which are
+    complete once the messages are read. `wanted`: says of a message's name whether it is decoded.
+
     Raises:
         ValueError: the database cannot be read.
         ModuleNotFoundError: python-can or cantools is not installed (extra "can"), or asammdf (extra "mdf").
@@ -126,6 +129,9 @@ class FrameReader:
     def read_messages(self) -> Iterator[FileMessage | InputError]:
         """Yield the messages in the order of the file, or why one cannot be read; then note what was left out.
 
+        `item` is a frame with its time, or the error that ends a damaged log. Error frames, remote frames and those of
+        another bus (`channel`) are left out and counted.
+
         Raises:
             ValueError: no frame of a wanted message, frames all of which are too short for it, or of two buses.
         """
@@ -162,6 +168,9 @@ class FrameReader:
 
     def _decode_frame(self, frame: "Message", moment: float, where: str) -> FileMessage | InputError | None:
         """Return the message in a frame, or the error that says why it cannot be read; None if it is not wanted.
+
+        `self._wanted` says whether a message of a name is decoded; without a database messages are named by their
+        identifiers. `_check_channel` refuses frames of one message from two buses.
 
         Args:
             frame: the frame.
@@ -226,7 +235,7 @@ class FrameReader:
         """Raise ValueError if all frames of a wanted message are too short, or if no frame is of a wanted message.
 
         By a message's name, `self._short` counts the sizes of frames too short to decode, and `self._decoded` counts
-        decoded frames.
+        decoded frames. `self._identifiers` counts the frames by identifier, for the error.
         """
         remedy = "another database, or another bus (channel=)?"
         for name, sizes in self._short.items():
@@ -243,7 +252,11 @@ class FrameReader:
 
 
 def _read_frames(path: Path, sources: LogSources) -> "Iterator[tuple[Message, float] | InputError]":
-    """Yield (frame, its time in seconds since 1970); if the file is damaged, the last item is a `CutOffError`."""
+    """Yield (frame, its time in seconds since 1970); if the file is damaged, the last item is a `CutOffError`.
+
+    `opened` has the reader, `begin` (the log's begin as the reader counts times) and `shift` (added to the reader's
+    times gives seconds since 1970). DIGITS: decimals of a time in seconds.
+    """
     count = 0
     with ExitStack() as stack:
         try:

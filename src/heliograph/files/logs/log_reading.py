@@ -53,7 +53,7 @@ def open_logs(path: Path, sources: LogSources, wanted: Wanted) -> Log:
 def _join_units(logs: Sequence[Log]) -> dict[str, dict[str, str]]:
     """Return {topic: {signal: its unit}} of the signals that any of the logs has.
 
-    Units of a signal that differ between logs stand side by side, as "m/s or km/h".
+    Units of a signal that differ between logs stand side by side, as "m/s or km/h". OR is " or ".
     """
     units = dict[str, dict[str, str]]()
     for log in logs:
@@ -69,7 +69,7 @@ def open_log(path: Path, sources: LogSources, wanted: Wanted) -> Log:
     """Open a vehicle's log; its format follows from its extension.
 
     ULog files, and MDF files without a database, hold decoded signals. All others hold frames of a CAN bus, raw bytes
-    from which a database of the bus's messages (DBC) decodes signals.
+    from which a database of the bus's messages (DBC) decodes signals. ULOG and MDF are the extensions of these formats.
 
     Args:
         path: the log.

@@ -81,7 +81,8 @@ def _read_group(file: "MDF", group: int, indices: dict[str, int]) -> MessageSeri
     """Return the samples of a group: times in seconds from the file's start, and the values of each signal.
 
     `indices` maps the name of a signal to its index in the group. A sample that the file marks as invalid becomes None.
-    A signal with several numbers per sample is left out.
+    A signal with several numbers per sample is left out. A `MessageSeries` is times and {signal: values}, (samples,)
+    each.
     """
     time, values = np.zeros(0), dict[str, np.ndarray]()
     for name, index in indices.items():

@@ -160,6 +160,9 @@ def _read_json_messages(path: Path) -> Iterator[FileMessage | InputError]:
 def parse_message_document(text: str | bytes, name: str) -> list[FileMessage | InputError]:
     """Return the messages of a JSON document, which may be nested lists; an error stands in place of a bad message.
 
+    `decode_items` yields each item of the document with the name of a field that occurs twice in it, or None: such an
+    item is an error.
+
     Raises:
         ValueError: the text is not JSON.
     """
@@ -173,7 +176,7 @@ def parse_message_line(where: str, line: str) -> list[FileMessage | InputError]:
     """Return the messages of a line, or the reason why it cannot be read.
 
     The line is JSON: a message or a list of messages. Otherwise it may be a topic and a payload, as MQTT clients print
-    them.
+    them. `parse_log_line` returns topic, payload and time of such a line, None if it is none.
     """
     line = line.strip()
     if not is_valid_text(line):

@@ -142,7 +142,11 @@ def read_events(
 
 
 def _read_bags(path: Path, sources: TopicReader, progress: Progress | None, strict: bool) -> EventTable:
-    """Return the events of a bag, or of the bags in a folder, with messages of ROS, in JSON or in Protocol Buffers."""
+    """Return the events of a bag, or of the bags in a folder, with messages of ROS, in JSON or in Protocol Buffers.
+
+    `holds_messages` says that a file is MCAP with JSON or Protocol Buffers, which is read by its own reader; all others
+    are bags of ROS.
+    """
     events = EventTable(sources.network, sources.step_seconds)
     for bag in parts_of(path) or [path]:
         if holds_messages(bag):
@@ -254,6 +258,7 @@ def _append_messages_by_topic(
     """Append the events of messages that name their topics, and return these topics.
 
     An unreadable message is counted (raised if `strict`). A `CutOffError` says where the file is damaged.
+    `events.broken` holds it as a text.
     """
     topics = set[str | None]()
     for message in messages:
@@ -348,6 +353,9 @@ def _append_reading(
 
 def _note_left_out(path: Path | StoreTable, sources: TopicReader, events: EventTable) -> None:
     """Add notes to the events on messages and files that were left out, and on clocks and senders of the sources.
+
+    `sources.clocks` has compared the clocks of topics, `sources.senders` the fields that name senders.
+    `sources.unknown` counts messages of topics without a source, `sources.stored` those that a broker had stored.
 
     Raises:
         ValueError: a field that no message of its topic had, clocks that cannot be joined.

@@ -132,6 +132,8 @@ class OwnMessageCollector:
     def _check_local_time(self, table: EventTable) -> None:
         """Note where a node's dates, which have no zone, jump forward by an hour, as local time does in spring.
 
+        `columns` has the events of one node of one plant, in the order in which they came.
+
         Raises:
             ValueError: a node's dates go back by an hour, as in autumn: sorted by time, messages of two hours would be
                 mixed.
@@ -151,7 +153,8 @@ class OwnMessageCollector:
     def _add_message(self, message: FileMessage) -> None:
         """Add the event of one message to the table, and an event of the inputs if the message holds inputs.
 
-        Of a message whose values cannot be read the running count is noted, and the error is raised.
+        Of a message whose values cannot be read the running count is noted, and the error is raised. The reader returns
+        a list of (event or `Unread`, arrival).
         """
         readings_and_arrivals = self._reader.read(message.where, message.content)
         if self._table is None:

@@ -191,6 +191,9 @@ class RowReader:
     def read(self, rows: TableRows) -> Recording:
         """Return the rows that can be read.
 
+        `read_cells` checks each row and leaves out those that cannot be read; `arrange_recording` puts the others in
+        order and fills what is missing.
+
         Raises:
             ValueError: unknown, missing or doubled columns; times that go backwards; a row that cannot be read, where
                 reading is strict. One line that names the row, from 1, and the column.
@@ -261,7 +264,8 @@ class RowReader:
         """Return the times, inputs, measurements and truth of the rows that can be read; each row is checked by itself.
 
         `self._headers` maps a header that a column may have to the column's name. `refusals.good` is the mask of the
-        rows that were not refused.
+        rows that were not refused. `refusals` collects the errors of refused rows, or raises the first one where
+        reading is strict.
 
         Raises:
             ValueError: the same as of `read`, but not for times that go backwards.

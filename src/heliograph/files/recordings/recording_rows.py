@@ -126,7 +126,8 @@ def lacks_second_row(cells: RecordingRows, network: Network, source: str) -> boo
     """Return whether `cells`, the first readable rows of a table, are too few to date the unreadable rows before them.
 
     If every row is a step (there is no input dt), the times of those rows are extrapolated from the first two readable
-    ones (`RowsWithMissing.fill_times`), so that a single one does not suffice.
+    ones (`RowsWithMissing.fill_times`), so that a single one does not suffice. `order_rows` returns the rows sorted,
+    those without a time that can be right left out.
     """
     if TIME_STEP in network.inputs or not len(cells.numbers):
         return False

@@ -81,6 +81,8 @@ def _check_time_unit(topic: str, source: Source, time_counts_steps: bool) -> Non
 def _find_output_indices(topic: str, source: Source, names: NamesByNode) -> dict[str, np.ndarray]:
     """Return {node: index among its numbers of each value of a source, (values,)}.
 
+    `names`: {node: names of its numbers}, "inputs" among the nodes.
+
     Raises:
         ValueError: an unknown node or output; one line that names the topic.
     """

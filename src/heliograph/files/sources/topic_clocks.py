@@ -71,6 +71,8 @@ class TopicClocks:
     def find_topics_without_dates(self, where: str) -> list[str]:
         """Return the topics whose clocks count from their own starts; raise ValueError if others have dates.
 
+        Times of both kinds cannot be put in one order; the error says how to give the date of a clock's start.
+
         Raises:
             ValueError: some topics count from their own start, and others have dates.
         """

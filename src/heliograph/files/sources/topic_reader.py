@@ -137,7 +137,10 @@ class TopicReader:
         return {name for path in paths for name in (path, path.split(".")[0])}
 
     def list_fields(self, topic: str) -> set[str]:
-        """Return the top-level fields of a topic's messages that sources use: the first words of their paths."""
+        """Return the top-level fields of a topic's messages that sources use: the first words of their paths.
+
+        A source's plant and node may be fields of the message, and a value may be computed from several (`parts`).
+        """
         if topic not in self._fields_of_topic:
             fields = self._fields_of_topic.setdefault(topic, set())
             for mapped in self.of(topic):
@@ -160,6 +163,7 @@ class TopicReader:
         """Return a reading of a message for each source of its topic; an unknown topic has none and is counted.
 
         If a source cannot read the message, an Unread with the reason stands there. A condition may leave it out.
+        `_read_without_values` reads node, count and time of such a message, so that it does not count as lost.
 
         Args:
             topic: the topic of the message.
@@ -254,7 +258,11 @@ class TopicReader:
         return Reading(plant, node, sequence, _read_time(source, message, where), values, period)
 
     def _is_left_out(self, source: Source, topic: str, message: object, where: str) -> bool:
-        """Return whether a message is left out, by a field's value or since its device is offline; count it if so."""
+        """Return whether a message is left out, by a field's value or since its device is offline; count it if so.
+
+        `source.where` has by path of a field its allowed values, `source.available` the conditions on devices' own
+        words. A field that is missing is an error.
+        """
         for field, allowed in source.where.items():
             if not is_allowed(field_at(message, field, where), allowed):
                 self.excluded[topic] += 1
@@ -293,7 +301,11 @@ class TopicReader:
         return Reading(plant, node, sequence, time, np.full(len(self.names[node]), np.nan), period)
 
     def _read_message_count(self, source: Source, pattern: str, message: object, where: str) -> tuple[int | None, bool]:
-        """Return a message's running count (None if the source has none), and whether its field is absent (count 0)."""
+        """Return a message's running count (None if the source has none), and whether its field is absent (count 0).
+
+        `self.found` and `self.absent` note which count fields came and which did not, by pattern of topics and path;
+        `check` refuses a count that the declared number of bits cannot hold.
+        """
         if source.sequence is None:
             return None, False
         path = source.sequence.path

@@ -35,6 +35,7 @@ def query_influx(address: StoreAddress) -> tuple[str, dict[str, Any]]:
 
     The statement in the address is asked in its language; without one all of the address's table is asked for, in
     InfluxQL. Several series, as from GROUP BY, become one table sorted by time, with their tags as columns.
+    `_send_request` returns the body of the answer. A parser makes of it the name and the columns.
 
     Raises:
         ValueError: the server does not answer or refuses, or nothing came.

@@ -72,6 +72,8 @@ def _convert_cell(cell: object) -> object:
 def query_store(address: StoreAddress) -> StoreTable:
     """Return the rows of a store's query or table.
 
+    The reader of the store's kind returns the name of the measurement or database, and the columns.
+
     Raises:
         ValueError: the server does not answer or refuses, there are no rows, or the URL has neither query nor table.
         ModuleNotFoundError: PostgreSQL without psycopg (extra "postgres").

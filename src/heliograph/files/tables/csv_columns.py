@@ -50,6 +50,9 @@ def read_csv_blocks(
 def _read_csv_lines(text: CsvReader, columns: "CsvColumnReader", lines: bytes) -> TableRows:
     """Return the rows in a block of whole lines: fast, all at once, if they are plain numbers, else cell by cell.
 
+    `text.header` has the names of the columns, [] before the header came; `text.number` counts the rows.
+    `parse_numeric_lines` returns None unless all cells are plain numbers.
+
     Args:
         text: splits lines into cells and knows the header; it is open while a quoted cell goes on in the next line.
         columns: makes columns of the cells, and refuses rows that cannot be read.

@@ -107,7 +107,7 @@ class CsvReader:
         """Return the row of these cells, or the error why they are no row, in a list.
 
         The list is empty for an empty line, an annotation of Influx and a header, which sets `self.header`. `broken`:
-        what is wrong with the line, if this is known already.
+        what is wrong with the line, if this is known already. `self.number` counts the rows behind the header.
 
         Raises:
             ValueError: the header names no columns, or a column twice.
@@ -134,7 +134,8 @@ class CsvReader:
     def _find_row_error(self, where: str, cells: list[str]) -> InputError | None:
         """Return the error if the cells are no row of this table, or None if they are one.
 
-        A line that begins with # is a comment, unless `self._marked` allows such rows.
+        A line that begins with # is a comment, unless `self._marked` allows such rows. `suggest_recoding` and
+        `suggest_rewrite` return the call of pandas that rewrites the file, for the error's text.
         """
         line = ",".join(cells)
         if not is_valid_text(line):

@@ -39,7 +39,8 @@ class TextStream:
         """Return the text, as UTF-8, that these bytes complete; `ended`: no more bytes will come.
 
         The first bytes are collected in `self._start` until they tell the encoding. Packed bytes are unpacked and read
-        by `self._inside`. UTF-16 is decoded by `self._decode`. Anything else is UTF-8 already.
+        by `self._inside`. UTF-16 is decoded by `self._decode`. Anything else is UTF-8 already. `self.has_more`: packed
+        bytes wait to be unpacked.
 
         Raises:
             ValueError: the bytes are no text.

@@ -29,7 +29,8 @@ from heliograph.simulation.node import Node
 def join_all_nodes(network: Network) -> tuple[AnyPlant, AnySensor, Channel]:
     """Return the plant, and the sensor and channel of all nodes together in their order, if all packets arrive.
 
-    A fit takes what all nodes receive as one measurement, since their sensors see one state.
+    A fit takes what all nodes receive as one measurement, since their sensors see one state. `join_links` stacks
+    sensors and channels side by side. A network with one channel for all nodes has it as `common`.
 
     Raises:
         ValueError: relays that filter and forward, sensors with feedback, senders of words (a sensor with a resolution
@@ -108,9 +109,10 @@ class Objective:
     def compute_innovations(self, x: Array, z: Array, u: Array) -> tuple[jax.Array, jax.Array]:
         """Return the filter's innovations (steps, m), NaN where nothing arrived, and their covariances (steps, m, m).
 
-        The filter has the free numbers at x (p,), and runs over measurements z (steps, received) and inputs u
-        (steps, inputs). Where the estimate is no number the innovation is 0 and its covariance NaN, so that the
-        likelihood is NaN there, and not that of a row in which nothing arrived.
+        The filter has the free numbers at x (p,), and runs over measurements z (steps, received) and inputs u (steps,
+        inputs). Where the estimate is no number the innovation is 0 and its covariance NaN, so that the likelihood is
+        NaN there, and not that of a row in which nothing arrived. `filter.scan(z, u, judged)` runs the filter over all
+        rows and stacks what `judged` returns of each.
         """
         filter = self.filter(x)
 
@@ -131,7 +133,7 @@ class Objective:
         """Return the errors (steps, n) of the estimates by the filter at x (p,), and the covariances that they claim.
 
         Errors are NaN where the truth is not known. z: measurements (steps, received). u: inputs (steps, inputs).
-        `truth`: true states (steps, n).
+        `truth`: true states (steps, n). Errors of angles are taken the short way around (`wrap_near`).
         """
         filter = self.filter(x)
         angles = first(self.description.start.plant).angles

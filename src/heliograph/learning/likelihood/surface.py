@@ -97,7 +97,8 @@ class LikelihoodSurface:
     def evaluate_rows(self, x: Float[np.ndarray, "points p"]) -> Evaluation:
         """Return the evaluation at points (points, p) with densities and scores by row.
 
-        Results by row are not kept for long recordings.
+        Results by row are not kept for long recordings. For those, only sums over rows were kept, one block, so that
+        they are evaluated again.
         """
         whole = self.evaluations(x)
         # The kept result has every row, unless recordings are long.
@@ -142,6 +143,7 @@ class LikelihoodSurface:
         """Return for each recording each row's observed information on k coordinates, -d(score_k)/dx_k, (steps, k).
 
         By central differences at the point x (p,), over DIFFERENCE_WIDTH standard errors; `coordinates`: their indices.
+        `evaluate_rows(points).score` is (points, recordings, steps, p).
         """
         deviation = self.standard_errors(x)[coordinates]
         # A number without a finite standard error is not moved, and has information 0.
@@ -305,7 +307,8 @@ def _find_ends_at_infinity(parameter: Parameter) -> tuple[Bool[np.ndarray, " siz
     """Return which coordinates of a free number reach an end of its domain at minus infinity, and which at infinity.
 
     Logits (such as of probabilities) have both ends. Logarithms have the end at minus infinity; a covariance has them
-    on its diagonal. A real number without ends has none.
+    on its diagonal. A real number without ends has none. `domain.low`, `domain.high`: ends of an interval, infinite
+    where it has none. A logarithm of the distance from either end has its end at minus infinity.
     """
     domain, none = parameter.domain, np.zeros(parameter.size, dtype=bool)
     if domain.kind == "simplex":

@@ -142,7 +142,7 @@ def find_coordinates_at_limits(x: np.ndarray, gradient: np.ndarray, domains: Ope
 
     A number v = exp(x) has its end v = 0 at x = -inf (`domains.low`). A logit also has one at x = inf (`domains.high`).
     To first order, the log-likelihood l gains l(0) - l(v) = -v l'(v) = -dl/dx up to the end; a gain below GAIN_TO_LIMIT
-    (1e-6 nats) counts as none.
+    (1e-6 nats) counts as none. `outward` is -1 or 1, the direction of the nearer end, 0 for a real number.
 
     Args:
         x: points (climbs, p).

@@ -141,7 +141,8 @@ def expected_gain(
     """Return g' I^-1 g (climbs,), twice what a full step gains: gradient g (climbs, p), information I (climbs, p, p).
 
     Only coordinates marked in `counting` (climbs, p) and identified directions count. A direction with an eigenvalue of
-    at most FLAT_EIGENVALUE, in units of standard errors, is not identified.
+    at most FLAT_EIGENVALUE, in units of standard errors, is not identified. The matrix is solved in units of standard
+    errors, in its eigenvectors.
 
     Args:
         gradient: g (climbs, p).

@@ -240,7 +240,7 @@ def _multiply_runs(matrices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the product of matrices (sets, runs, 2, 2) over runs, the last leftmost, and the log of its scale.
 
     The product is the returned matrix (sets, 2, 2) times its scale (sets,). Each turn multiplies pairs, which halves
-    the number of matrices.
+    the number of matrices. An odd number of matrices is filled up with the identity.
     """
     log_scale = np.zeros(len(matrices))
     while matrices.shape[1] > 1:

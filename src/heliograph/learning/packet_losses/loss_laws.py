@@ -74,7 +74,8 @@ class AbstractLossLaw(Module):
         A fate is 0 (arrived), 1 (lost) or NaN (unknown). If the stretch was cut where packets arrived, its first and
         last fate are CHOSEN: they arrived, but say nothing of losses. The first has NaN. The sum of all entries has to
         be log P(fates between, last arrives | first arrived) - log P(last arrives | first arrived), so the last entry
-        is log P(last arrives | all earlier fates) - log P(last arrives | first arrived).
+        is log P(last arrives | all earlier fates) - log P(last arrives | first arrived). `find_trials` marks fates of 0
+        and 1; `fill_ends` writes 0 in place of CHOSEN.
         """
         p = self.predicted(fill_ends(fate))  # P(lost) of each packet; chosen ends count as arrived for those after them
         with np.errstate(divide="ignore"):

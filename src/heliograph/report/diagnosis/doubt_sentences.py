@@ -75,7 +75,10 @@ def say_node_differs(error: ConstantError) -> str:
 
 
 def say_underconfident(name: str, outputs: Sequence[str], sizes: Sequence[float]) -> str:
-    """Return the sentence on a NIS below its interval, as it is also if a filter follows its sensor's slow error."""
+    """Return the sentence on a NIS below its interval, as it is also if a filter follows its sensor's slow error.
+
+    `name`: of the filter. `sizes`: for each of `outputs` the mean square of its innovations over what is claimed.
+    """
     of, times = _format_outputs_and_sizes(outputs, sizes)
     return (
         f"{name} expects more{of} than comes: the mean square of its innovations is {times} times what it claims. "

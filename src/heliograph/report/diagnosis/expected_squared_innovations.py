@@ -18,6 +18,7 @@ def compute_expected_squares(
     It is the innovation's variance given this recording, divided by its variance over all runs. That is 1 for most
     filters. With random gains of the links it is not, since the state of this run differs from its mean over all runs.
     Then `given_record` returns another filter, whose covariances are given the data; else it returns the filter itself.
+    `data`: what the filter received (steps, m). The result (steps, m) is 1 too where no variance is claimed.
     """
     conditioned = filter.given_record()
     if conditioned is filter:

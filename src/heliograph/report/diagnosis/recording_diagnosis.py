@@ -91,7 +91,8 @@ def examine(
 def _explain_doubts(network: Network, health: Health, inputs: np.ndarray) -> Health:
     """Return the diagnosis with what may explain doubts: a constant error of an output or node, another unit of time.
 
-    A stuck output makes nodes disagree, too; then no constant error between nodes is looked for.
+    A stuck output makes nodes disagree, too; then no constant error between nodes is looked for. `list_doubted_filters`
+    are the trusted ones whose claims the recording contradicts; keys of the errors are (node, filter).
     """
     errors = {
         (filter.node, filter.filter): _find_constant_error(network, health, filter, inputs)
@@ -123,6 +124,7 @@ def _examine_filter(
     if filter.claim != "none" and filter.received:
         # Whiten the innovations, test their correlation over time (of a filter that weighs outliers down, about their
         # mean), and compare their size with the expected one.
+        # `scores` are the innovations L^-1 (z - E z); the log densities before them are not needed.
         _, scores = score_innovations(filter, z, inputs)
         white = np.asarray(scores)
         test = find_memory(subtract_mean(white) if weighs(filter) else white)
@@ -144,7 +146,11 @@ def _examine_filter(
 
 
 def _doubt_time_unit(network: Network, health: Health, inputs: np.ndarray) -> str:
-    """Return the sentence that times seem to be in another unit, judged by the first doubted filter, or ""."""
+    """Return the sentence that times seem to be in another unit, judged by the first doubted filter, or "".
+
+    Filters with enough rows for a test count. `_find_judged_filter` returns the filter itself, its name and node, and
+    the measurements that it received.
+    """
     tested = [judged for judged in health.list_doubted_filters() if judged.test is not None]
     if not tested:
         return ""
@@ -162,7 +168,11 @@ def _find_judged_filter(network: Network, record: Record, judged: FilterHealth) 
 def _find_constant_error(
     network: Network, health: Health, judged: FilterHealth, inputs: np.ndarray
 ) -> ConstantError | None:
-    """Return the constant error of an output that explains all or MOST of a filter's doubts, or None."""
+    """Return the constant error of an output that explains all or MOST of a filter's doubts, or None.
+
+    `explained` is the share of the excess of squared innovations that the error explains; `nothing_else` says that the
+    innovations without its effect are as claimed. None too without a test of the filter's innovations.
+    """
     if judged.test is None:
         return None
     tested = _find_judged_filter(network, health.record, judged)

@@ -49,6 +49,9 @@ def compute_filter_errors(record: Record) -> list[FilterErrors]:
     They are the RMSE of each state, and the NEES e' P^-1 e divided by the number of states whose truth is known, with
     e the error and P the claimed covariance: 1 where the claim holds. Both come with standard errors. `record` has true
     states and estimates of a run, by node and filter; Network.FUSED stands for the fusion centre.
+
+    `claim` is the weakest claim that the filter had in any row; `weakest` chooses it. `average_correlated` returns a
+    mean over rows that are correlated over time, and its standard error.
     """
     if record.truth is None:
         return []
@@ -148,7 +151,8 @@ def yield_filters_with_measurements(network: Network, record: Record) -> Iterato
     """Yield every filter with its measurements: those of the nodes, then central ones.
 
     A filter is trusted if the network relies on it. It blames (its weights decide which outputs are bad) if it weighs
-    outputs and is trusted, or if it weighs outputs and no trusted filter of the node does.
+    outputs and is trusted, or if it weighs outputs and no trusted filter of the node does. A central filter receives
+    the numbers of all nodes, one node after the other; it is trusted, and blames.
     """
     received = record.measurements
     relied_on = _list_relied_on_filters(network)
@@ -210,7 +214,8 @@ def judge_outputs_of_filter(
 
     Args:
         network: the network.
-        listener: the filter with its names and the measurements (time, outputs) that it received.
+        listener: the filter with its names, the measurements (time, outputs) that it received, and `blames`, whether
+            its weights say which output is to blame.
         record: the run of the network, which holds the innovations of filters that weigh outliers down.
         inputs: inputs of the plant (time, inputs).
     """
@@ -340,7 +345,11 @@ class RecentInnovations:
 
 
 def summarise_weighed_outputs(network: Network, record: Record) -> list[OutputHealth]:
-    """Return what the innovations of all weighing filters say about each output of a recording."""
+    """Return what the innovations of all weighing filters say about each output of a recording.
+
+    `record.weighed` has the innovations, variances and weights by node and filter. The judgement of an output has its
+    bias, the share of its values that were weighted down, and whether it is to blame.
+    """
     # Inputs are not needed (an empty array), since the record holds these filters' innovations.
     outputs: list[OutputHealth] = []
     no_inputs = np.zeros(0)

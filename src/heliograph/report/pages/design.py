@@ -49,7 +49,12 @@ class DesignResults:
 
 
 def make_design_results(results: DesignResults) -> ResultsContent:
-    """Return the content of the results folder of a design: figures, page, summary and the two networks' sources."""
+    """Return the content of the results folder of a design: figures, page, summary and the two networks' sources.
+
+    `results` has the design, the powers before it, the least error by total power (`front`), what changes are worth,
+    and the source of both networks. `page` and `write_data` are called later, with the figures as SVG and with the
+    folder.
+    """
     return ResultsContent(
         figures=draw_design_figures(results),
         page=partial(make_design_page, results),
@@ -71,7 +76,12 @@ def compute_mean_powers(design: PowerDesign) -> dict[str, float]:
 
 
 def make_design_summary(results: DesignResults) -> dict[str, Json]:
-    """Return all numbers of the report of a design by name, as summary.json holds them."""
+    """Return all numbers of the report of a design by name, as summary.json holds them.
+
+    `certificate` is the proof of how good the design is: a lower bound of the error, and the gap to it. `front` is the
+    least error by total power; `changes` are what one more transmitter, relay or place saves; `map` has the error over
+    places for one more, or is None.
+    """
     design, certificate = results.design, results.design.certificate
     # JSON has no arrays: all numbers become lists.
     best = None if results.map is None else dict(zip(("x", "y", "error"), results.map.best, strict=True))
@@ -166,7 +176,11 @@ def draw_error_map(sites: ErrorsOverSites) -> Figure:
 
 
 def make_design_page(results: DesignResults, drawings: Mapping[str, bytes]) -> Page:
-    """Return the page of a design; `drawings` holds each figure as SVG, by the names of `draw_design_figures`."""
+    """Return the page of a design; `drawings` holds each figure as SVG, by the names of `draw_design_figures`.
+
+    Sections: the result with its certificate, the front (least error by total power), the powers, a map of places if
+    one was asked for, what changes would save, and how to run the network.
+    """
     design = results.design
     sections = [_make_result_section(results), _make_front_section(drawings), _make_powers_section(results, drawings)]
     if results.map is not None:

@@ -86,7 +86,8 @@ def _draw_estimates(learned: FitResults) -> Figure:
     """Draw the estimates with intervals and start values, a panel for each free number, since units differ.
 
     There is an estimate for each form of the likelihood: "linear" takes what random gains add to the variance from
-    moments before any data, "conditional" from moments given the data. The best form is drawn in blue.
+    moments before any data, "conditional" from moments given the data. The best form is drawn in blue. `rows` are the
+    lines of the table of estimates: name, estimate and interval of each free number, one table for each form.
     """
     rows = learned.fit.rows()[:MOST]
     # The best form is the last of the solutions. It is drawn at height 0, another one below it at -1.
@@ -163,7 +164,11 @@ def _draw_probability_transforms(received: list[HeldOutTransforms]) -> Figure:
 
 
 def make_fit_page(learned: FitResults, drawings: Mapping[str, bytes]) -> Page:
-    """Return the page of a fit; `drawings` holds each figure as SVG, by the names of `draw_fit_figures`."""
+    """Return the page of a fit; `drawings` holds each figure as SVG, by the names of `draw_fit_figures`.
+
+    `learned` has the fit, the numbers of rows that were learned from and held out, what each filter predicts of the
+    held-out rows before and after, and the laws of lost measurements by node.
+    """
     return Page(
         kicker="Heliograph fit",
         title=_make_headline(learned),
