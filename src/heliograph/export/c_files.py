@@ -113,6 +113,9 @@ def write_filter_files(
     """Write a filter as two files of C, and return what was written, as `export_c` does for a user's filter.
 
     `received` are the names of the measurement's components; the other arguments are those of `export_c`.
+
+    `apart`: prediction and correction are functions of their own, too. `size`: small rather than fast. `window`: how
+    many steps late a measurement may be, None for none. `make_c_text` makes the text of both files.
     """
     source = check_source_path(path)
     if precision not in PRECISIONS:

@@ -122,6 +122,10 @@ def _generate_part_statements(program: StepProgram, number: int, prefix: str) ->
     All is computed into `after`, a struct like the state, so that a refusal changes nothing. A refusal returns its
     code: 4 the estimate would not be finite, 5 it would lose its digits, 6 the inputs are none.
 
+    `program.read` are the members of the state that a part reads, with their numbers before the first step (`start`),
+    `program.members` those that it writes. `program.mean` names the member with the estimate's mean, and
+    `program.counts` says whether the state counts its steps.
+
     Args:
         program: the step as C functions; `other_results` of a part names results other than the state, such as the
             flags "implausible" (code 5) and "spoilt" (code 6).

@@ -134,8 +134,8 @@ def _read_budget(path: Path, table: Mapping[str, Any]) -> Budget | None:
 def _read_map_places(path: Path, table: Mapping[str, object]) -> MapPlaces:
     """Return the places of the map that a design file asks for: the network's function of x and y, and the grid.
 
-    The map shows the error with a node at each place of the grid. `values`: the keys network, points, x and y of the
-    table; x and y are the ends of the axes.
+    The map shows the error of the network that this function returns for each place of the grid. `values`: the keys
+    network, points, x and y of the table; x and y are the ends of the axes.
     """
     values = _read_table(path, table, "map")
     file, name = _find_python_file(path, values.get("network"), "map.network")

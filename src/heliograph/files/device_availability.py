@@ -122,7 +122,7 @@ class DeviceStatuses:
         """Note a device's word, online or offline, if a message is one; return whether it is.
 
         An empty message deletes a word that the broker stores, and counts as online. `self._changed` has the topics
-        whose stored status is no longer true.
+        whose status must be stored anew.
 
         Args:
             topic: the topic of the message.

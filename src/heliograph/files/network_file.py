@@ -126,7 +126,8 @@ def _read_named_network(
 ) -> Network:
     """Return the network that a name of a module stands for, or that the function of this name returns.
 
-    `networks`: those of the module by name, for errors. `file` and `path`: as of `_find_network`.
+    `networks`: those of the module by name, for errors. `file` and `path`: the module's file or name for errors, and
+    the file in which the line of an error is looked for.
     """
     if not hasattr(module, name):
         close = get_close_matches(name, [key for key in vars(module) if not key.startswith("_")], 1)

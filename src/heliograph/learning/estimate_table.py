@@ -178,7 +178,9 @@ class Solution:
         """Return the table of estimates by this form, with intervals by a method; it is computed at the first call.
 
         Args:
-            method: how intervals are computed, as of `Fit.rows`.
+            method: how intervals are computed: "cosines" and "bartlett" allow for scores that are correlated over time,
+                "white" does not, "hessian" believes the model, "profile" cuts the likelihood, "bootstrap" draws blocks
+                of scores.
             level: probability with which an interval holds the number.
         """
         key = method, level
@@ -238,7 +240,7 @@ class Solution:
         number with these slopes.
 
         Args:
-            method: how intervals are computed, as of `Fit.rows`.
+            method: how intervals are computed, "cosines", "bartlett", "white", "hessian", "profile" or "bootstrap".
             level: probability with which an interval holds the number.
         """
         covariance, freedom = self.covariance("hessian" if method == "profile" else method)

@@ -83,6 +83,8 @@ def fit(
     # The likelihood over the free numbers in each form, where to begin, and what the data identify at all.
     surfaces = [LikelihoodSurface(objective, data) for objective in make_objectives(description, truth is not False)]
     points = _choose_starts(surfaces[0], starts, seed)
+    # `identified`: sentences on the numbers that the data do not tell apart, and `ridges`, the number of directions in
+    # which the likelihood does not change; `or_sharper` takes the better known of two such results.
     identified = identify_by_recording(surfaces[-1], points[0], seed)
     # The maximum of each form, and the estimates and intervals in the sentences on what is identified.
     solutions, ends, stopped = _maximise_forms(surfaces, points, seed, identified.ridges, report)

@@ -138,7 +138,8 @@ def transform_held_out(
 
     Args:
         network: the network with the numbers learned.
-        outcome: predictions of the rows from `cut` on, as `compare_before_and_after` returns them.
+        outcome: predictions of the rows from `cut` on, by node and filter, before and after learning, with the whitened
+            innovations of these rows.
         measurements: measurements by node (rows, received).
         inputs: inputs of the plant (rows, inputs).
         cut: number of the first row that was not learned from.

@@ -191,7 +191,10 @@ class HeliographMessageReader:
     def __init__(self, network: Network, source: str, ignore_unknown: bool, table: bool):
         """Prepare to read messages in heliograph's own format; nothing is known yet of their times and columns.
 
-        The class describes the arguments, and the attributes on times: `numbers`, `zero`, `rounded`, `least`, `most`.
+        `source` is named in errors. `ignore_unknown`: whether columns that the network does not know are left out.
+        `table`: whether messages are rows of a table. Of the times, `numbers` says whether they are numbers and not
+        dates, `zero` is the integer from which they are counted, `rounded` the first one that is no exact double then,
+        `least` and `most` are the ends of their range.
         """
         self.network, self.source = network, source
         self._ignore, self._table = ignore_unknown, table

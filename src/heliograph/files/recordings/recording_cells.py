@@ -74,6 +74,7 @@ def read_cells(columns: Mapping[str, np.ndarray], network: Network, refusals: Ro
     if TIME in inputs:
         raise fail("input names", f"none called {TIME!r}, which is the recording's own column", list(inputs))
     truth_columns = list_truth_columns(network)
+    # For each quantity the names that its column may have, the preferred one first; any other column is refused.
     expected = [
         (TIME,),
         *((name,) for name in inputs),
@@ -81,6 +82,7 @@ def read_cells(columns: Mapping[str, np.ndarray], network: Network, refusals: Ro
         *((name,) for name in truth_columns.values()),
     ]
     _refuse_unknown_columns(columns, expected, source)
+    # Read column by column: `_find_column` returns which of the names a column has, or raises.
     time = _read_times(columns, _find_column(columns, (TIME,), source), refusals)
     measurements = {}
     for node, components in received.items():

@@ -44,7 +44,7 @@ def read_csv_blocks(
             yield columns.read([lines])
         else:
             yield _read_csv_lines(text, columns, lines)
-    yield columns.read(text.end())
+    yield columns.read(text.end())  # rows of a quote that was never closed
 
 
 def _read_csv_lines(text: CsvReader, columns: "CsvColumnReader", lines: bytes) -> TableRows:

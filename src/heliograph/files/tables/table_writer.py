@@ -121,6 +121,7 @@ def predict_name_read_back(name: str) -> str:
     """Return the name that a column has when it is read from the CSV file to which it was written.
 
     Cells cannot hold every name: characters that cannot be printed are written as codes, blanks at the ends are lost.
+    `quote_for_cell` writes it as a spreadsheet may safely show it, `unquote_cell` undoes that.
     """
     return unquote_cell(quote_for_cell(name).strip())
 

@@ -227,7 +227,11 @@ def list_forms(description: Description) -> list[Form]:
 
 
 def make_filter_of_form(network: Network, form: Form) -> AbstractFilter:
-    """Return the filter of all that a network receives whose likelihood has this form, or its own for "truth"."""
+    """Return the filter of all that a network receives whose likelihood has this form, or its own for "truth".
+
+    "linear" filters by the moments of the gains before any data, "conditional" by those given the data;
+    `likelihood_filter` makes either for the joined channel of all nodes.
+    """
     if form == "truth":
         return find_sole_filter(network)
     plant, sensor, channel = join_all_nodes(network)

@@ -279,7 +279,8 @@ def judge_outputs(
         medians: medians (m,) that the innovations have anyway, where the noise's law is not symmetric; a bias is
             measured from these.
         blames: whether the filter weighs outliers down, so that low weights tell which output has them.
-        expected: expected squares of the innovations (time, m), as `compute_expected_squares` returns them.
+        expected: what the model expects of each squared innovation (time, m) in this recording, over its variance in
+            all runs; 1 for most filters.
         laws: law of each output's noise, by which equal values are judged; None where they are not known.
     """
     # Subtract from each bias, and from both ends of its interval, the median that the law of the noise explains.

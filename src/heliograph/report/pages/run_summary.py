@@ -65,7 +65,8 @@ def _list_filter_numbers(tested: FilterHealth) -> dict[str, Json]:
     """Return the numbers on one filter by name: its claim, and tests of its innovations.
 
     size: mean of innovation^2 / variance, 1 if the covariance holds. correlation: of successive innovations. declared:
-    tests of noise variances that are reported with messages, one for each class of messages.
+    tests of noise variances that are reported with messages, one for each class of messages. `test` is None with too
+    few rows or without a claim; `power` is the size, and the correlation is by lag, lag 1 first.
     """
     numbers: dict[str, Json] = {"claim": tested.claim}
     if tested.test is not None:
