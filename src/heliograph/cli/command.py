@@ -78,6 +78,8 @@ def _run_command(arguments: Sequence[str] | None) -> int:
 
     `app` is the command line, by Cyclopts; `bound` are the arguments of the command's function. `_print_refusal` prints
     the line and returns the status 2.
+
+    FULL are the error numbers of a full disk and such; EXTRAS maps a package to the extra that brings it.
     """
     with suppress(ValueError):  # where the user's home cannot be written to everything is compiled again
         keep_compilations()

@@ -264,7 +264,8 @@ def _write_lagged_estimates(
 
     Such estimates use messages that come late, but wait no longer than the lag. They are found by replaying the
     messages as they came. Returned is a line for the user; none without a lag, and none for rows of time, which have no
-    order of arrival. `target`: where the estimates are written; `write` writes a table there.
+    order of arrival. `target`: where the estimates are written; `write` writes a table there. `capacity`: rows that the
+    replay holds at a time.
     """
     if lag is None or data.events is None:
         return []

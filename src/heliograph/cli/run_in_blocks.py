@@ -82,7 +82,10 @@ def run_in_blocks(
 
 
 def is_long(path: Path, limit: BlockSize = LONG) -> bool:
-    """Return whether a table is too long to be read at once: CSV of too many bytes, or Parquet of too many rows."""
+    """Return whether a table is too long to be read at once: CSV of too many bytes, or Parquet of too many rows.
+
+    `limit`: by default 16 MiB and 262,144 rows.
+    """
     from heliograph.files.text.text_file import find_extension
 
     if not path.is_file():

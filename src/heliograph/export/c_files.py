@@ -132,6 +132,8 @@ def write_filter_files(
 def check_source_path(path: str | Path) -> Path:
     """Return the checked path of the C source; the file's name is the prefix of the names in it.
 
+    MADE is a text that exported headers have, by which an earlier one may be replaced; RESERVED has the words of C.
+
     Raises:
         ValueError: the file does not end in .c, cannot be written, or has a name that is no name of a C function; the
             header would replace a file of somebody else.

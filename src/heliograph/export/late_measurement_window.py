@@ -60,7 +60,8 @@ def check_and_count_window_steps(filter: AbstractFilter, steps: object) -> int:
     steps, and the prediction over an interval should be that over its two parts: warn if it is not. `filter.assumed`
     are plant, sensor, channel and trigger that the filter takes for true, None if it names none;
     `find_indivisible_part` names a part that counts steps, and `explain_uneven_prediction` says why a prediction over
-    an interval differs from that over its parts. Both return nothing where all is well.
+    an interval differs from that over its parts. Both return nothing where all is well. TIME_STEP is the input "dt",
+    which only a plant in continuous time has.
 
     Raises:
         ValueError: no positive whole number; a filter in continuous time with a part of its model that counts steps.
@@ -206,7 +207,8 @@ def _generate_window_functions(window: LateMeasurementWindow, prefix: str, real:
     """Return the text of the window's C functions, made from the templates below.
 
     The names that the templates leave open are the prefix p of all names in C, counts of rows, and statements that
-    depend on the lengths of measurement and inputs.
+    depend on the lengths of measurement and inputs. DIGITS: relative rounding of the type `real`, to which times are
+    compared.
     """
     received, inputs = window.received, window.inputs
     missing = " && ".join(f"(isnan(z[{i}]) != 0)" for i in range(received)) or "1"

@@ -159,6 +159,8 @@ def is_implausible(filter: AbstractFilter, innovation: Innovation, z: jax.Array,
     It is also implausible if one of the filter's angles has too many turns for numbers of type `real`. Each component's
     own deviation is used, since the joint distance would cost more. If the innovation is only of a part of z, such as a
     neighbour's measurement, every component that is so far off counts. A relative difference up to ROUNDING does not.
+    PRECISION maps `real` to NumPy's type, whose relative rounding is `eps`; ROUNDING is 1e-9 for double and 1e-4 for
+    float.
     """
     is_far, difference = Judgement.find_far(innovation), jnp.abs(jnp.asarray(innovation.value))
     if difference.shape == z.shape:

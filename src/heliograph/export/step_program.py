@@ -208,6 +208,7 @@ def _lower_start_to_c(filter: AbstractFilter, kept: list[int], names: list[str],
     factoring, so that the product of the factors differs from it: this sets the flag.
 
     The results have the names of those of a step, `next_` and the member's, since both write the members of a state.
+    `to_c` translates a function of JAX for arguments like the examples.
 
     Args:
         filter: the filter.
@@ -269,7 +270,10 @@ def make_unsupported_error(operation: str, where: str) -> InputError:
 
 
 def name_state_arrays(state: PyTree) -> list[str]:
-    """Return names in C for the arrays of a state, from their field names; the field `gaussian` is left out."""
+    """Return names in C for the arrays of a state, from their field names; the field `gaussian` is left out.
+
+    RESERVED has the words of C, ADDED the members that stand beside the state's arrays.
+    """
     names: list[str] = []
     for path, _ in jax.tree_util.tree_flatten_with_path(state)[0]:
         # Each key of the path is that of an attribute, of a dictionary, or an index in a sequence.

@@ -84,6 +84,7 @@ def write_fitted(content: Mapping[str, object], reference: str, measurements: st
         relative = Path(os.path.relpath(path.resolve(), target.resolve())).as_posix()
         source = f"str(HERE / {relative + colon + name!r})"  # quoted, whatever characters the path has
     named = {"network": _quote_in_docstring(reference), "measurements": _quote_in_docstring(measurements)}
+    # The template of a Python file that loads the network and puts the fitted numbers in.
     text = SOURCE.format(**named, fitted=FITTED, file=NETWORK, reference=source)
     (folder / NETWORK).write_text(text, encoding="utf-8")
 

@@ -88,6 +88,7 @@ class TopicStatistics:
         """Choose as time the first clock with a number in every message that never goes back, if there is one.
 
         It then also says when messages were logged. If that is known already (`self.logged`), no clock is chosen.
+        `self.clocks` has the numbers of each field that is named as a clock; UNITS maps a unit to its nanoseconds.
         """
         if self.logged:
             return
@@ -181,7 +182,11 @@ def _match_clock_name(path: str) -> re.Match[str] | None:
 
 
 def _read_unit_of_clock_name(path: str) -> Literal["s", "ms", "us", "ns"]:
-    """Return the unit with which a clock's name ends, as in "uptime_ms"; seconds if it has none."""
+    """Return the unit with which a clock's name ends, as in "uptime_ms"; seconds if it has none.
+
+    UNITS are s, ms, us and ns; `_match_clock_name` returns the match of the name's pattern, whose group `unit` is the
+    ending, or None.
+    """
     match = _match_clock_name(path)
     unit = None if match is None else match["unit"]
     return next((known for known in UNITS if known == unit), "s")

@@ -116,7 +116,7 @@ def compare_before_and_after(
             old = _predict_rows(old_filter, z, inputs, cut)
             new = _predict_rows(after.nodes[name].filters[key], z, inputs, cut)
             received = ~np.all(np.isnan(old.white), axis=1)  # rows in which anything arrived
-            # Mean gain of log-likelihood in these rows, with its standard error; None with too few rows for a test.
+            # Mean gain of log-likelihood in these rows, with its standard error; None with fewer than LAGS (10) rows.
             gain = None
             if received.sum() >= LAGS:
                 gain = test_zero_mean((new.log_likelihood - old.log_likelihood)[received])

@@ -94,6 +94,8 @@ class _MarkedNumber:
     def __init__(self, start: np.ndarray, name: str | None, kind: Kind | None):
         """Store what the user said of the number; its places are told later by `report`.
 
+        DOMAINS maps a kind to the values that are allowed, its domain.
+
         Args:
             start: value from which a search begins.
             name: its name, or None if the user gave none.
@@ -251,7 +253,7 @@ class Description:
 
         It tells whether a gain is random at all, which may not be so at the start itself. If no network can be built on
         either side of the start, it is the network at the start. `at_point` builds the network at unconstrained
-        coordinates. The number IRRATIONAL makes all distances from the start different.
+        coordinates. The number IRRATIONAL makes all distances from the start different. DISTANCE_FROM_START is 0.1.
         """
         start = self.parameters.start
         fractions, _ = np.modf(IRRATIONAL * np.arange(1, len(start) + 1))  # different for each number

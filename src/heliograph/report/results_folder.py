@@ -64,7 +64,8 @@ def write_results(
         ValueError: a folder that cannot be written, or that holds something else.
         ModuleNotFoundError: an extra is not installed.
     """
-    # Before the long computation: are the packages there, and may the folder be replaced?
+    # Before the long computation: are the packages there (NEEDS: for figures and pages), and may the folder be
+    # replaced?
     check_installed([*NEEDS, *needs])
     check_replaceable(target)
     # One stage more than the computation's: writing. `whole_folder` gives a temporary folder, which takes the place of

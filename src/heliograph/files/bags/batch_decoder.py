@@ -144,8 +144,8 @@ class MessageLayout:
         """Note the bytes of the wanted numbers among `count` numbers in a row; return the byte after the last.
 
         `names` holds the paths of the numbers. `kind` is their type, such as "uint16", whose size in bytes is in
-        NUMBERS. Every number begins at a multiple of its size. `self._paths`: paths of the wanted numbers.
-        `self.fields`: {path: (first byte, type)}. LayoutNotFixedError: the type has no fixed size.
+        NUMBERS. Every number begins at a multiple of its size. LayoutNotFixedError: the type has no fixed
+        size. `self._paths`: the wanted paths. `self.fields`: {path: (first byte, type)}.
         """
         size = NUMBERS.get(kind)
         if size is None:
@@ -234,7 +234,7 @@ class BatchDecoder:
         groups = defaultdict[tuple[str, int], list[int]](list)
         for i, message in enumerate(batch):
             groups[message.connection.topic, len(message.data)].append(i)
-        if FEWEST * len(groups) > len(batch):  # too few of a kind to be worth it
+        if FEWEST * len(groups) > len(batch):  # fewer than 5 of a kind on average are not worth it
             raise LayoutNotFixedError
         results = defaultdict[str, list[NodeReadings]](list)
         counts = Counter[str]()
@@ -384,7 +384,7 @@ def _compute_value_column(columns: dict[str, np.ndarray], path: str | Computed) 
 def _decode_column(table: np.ndarray, begin: int, kind: str) -> np.ndarray:
     """Return the number of type `kind`, such as "uint16", at byte `begin` of each message, (messages,).
 
-    `table` holds the bytes of messages, (messages, size); numbers are encoded little end first.
+    `table` holds the bytes of messages, (messages, size); numbers are little end first. NUMBERS: bytes of each type.
     """
     column = np.ascontiguousarray(table[:, begin : begin + NUMBERS[kind]])
     return column.view(np.dtype(kind).newbyteorder("<"))[:, 0]

@@ -85,7 +85,7 @@ class Pose:
 
 def find_pose_states(states: tuple[str, ...]) -> Pose:
     """Return the pose of the states that are named after axes."""
-    axes = (*AXES, *(f"v{axis}" for axis in AXES))
+    axes = (*AXES, *(f"v{axis}" for axis in AXES))  # x, y, z, roll, pitch, yaw, and the same with v for velocities
     return Pose(**{axis: axis for axis in axes if axis in states})
 
 
@@ -143,7 +143,7 @@ def _load_ros2_message_types() -> Any:
 def _convert_times_to_nanoseconds(time: np.ndarray, origin: np.datetime64 | None) -> list[int]:
     """Return times in nanoseconds since 1970, from dates or from seconds after `origin` (1970 if it is None).
 
-    Times that are numbers of steps are taken as seconds.
+    Times that are numbers of steps are taken as seconds. LATEST is 2^31 seconds: later ones have no 32 bits.
 
     Raises:
         ValueError: a time that no stamp of ROS can say.
@@ -236,7 +236,7 @@ def _yield_messages(record: Record, times: list[int], pose: Pose, types: Any) ->
                 odometry = _make_odometry(stamp, estimates.mean[k], claimed, state_indices, pose, types)
                 yield stamp, f"{estimates.prefix}/odometry", odometry
             for topic, number in _yield_state_numbers(estimates, k, record.states):
-                yield stamp, topic, types[NUMBER](number)
+                yield stamp, topic, types[NUMBER](number)  # a message of one number
 
 
 def _yield_state_numbers(estimates: _FilterEstimates, k: int, states: tuple[str, ...]) -> Iterator[tuple[str, float]]:

@@ -81,6 +81,9 @@ def _yield_messages_of_chunk(
 ) -> Iterator[RawMessage]:
     """Yield the messages of one chunk, as they stand in it.
 
+    RECORD_HEAD, CHECKSUM and MESSAGE_HEAD are formats of `struct`: kind and length of a record; a checksum; channel,
+    count, and times of logging and publishing of a message. MESSAGE is the kind of a record with a message.
+
     Args:
         storage: the open file.
         chunk: a compressed group of records in the file, as the file's index has it.

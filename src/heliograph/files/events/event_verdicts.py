@@ -77,7 +77,8 @@ def judge_events(
     An event is a node's message, with time, arrival and running count; all events of a time, or one alone, make a row.
     It is in the future if its time is later than its arrival by more than `ahead`. It is late if its row was final
     before it came: at each arrival the rows older than that by more than the window become final. Of events of one
-    node, count and time the first is used; if rows are joint, so are the first values of a node at a time.
+    node, count and time the first is used; if rows are joint, so are the first values of a node at a time. USED, LATE,
+    FUTURE, DUPLICATE and CONFLICT are such indices.
 
     Args:
         events: the events, in order of arrival.

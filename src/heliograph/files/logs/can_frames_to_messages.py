@@ -77,10 +77,10 @@ def read_can_database(path: Path) -> Database:
 def find_words(signal: "Signal") -> dict[float, str]:
     """Return {value: word} for values of a physical quantity that are no measurement, such as "SNA" (not available).
 
-    A value stands for a word if the database names it and it is out of the signal's range, or is at the end of what
-    its bits hold: from 0xFB.. of 0xFF.. on, or for a signed signal the least and the greatest. A named value within
-    the range, such as 0 "standstill", is a measurement. So are all values of a signal without unit, scale and offset,
-    which counts or enumerates.
+    A value stands for a word if the database names it and it is out of the signal's range, or is at the end of what its
+    bits hold: from 0xFB.. of 0xFF.. on, or for a signed signal the least and the greatest. A named value within the
+    range, such as 0 "standstill", is a measurement. So are all values of a signal without unit, scale and offset, which
+    counts or enumerates. CODES is 0xFB / 0xFF.
     """
     is_quantity = signal.unit or signal.scale != 1 or signal.offset != 0
     if not is_quantity or not signal.choices or signal.is_float:

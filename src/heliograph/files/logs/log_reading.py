@@ -128,6 +128,8 @@ def _find_signal_units(where: str, path: Path, log: Log, sources: TopicReader) -
     A log holds messages, each with signals. A source says which signal of which message is a measurement; a topic is
     the name of a message. A topic of the sources with a wildcard (+ or #) need not be in the log.
 
+    STAMP is the field "timestamp", OR the text " or " between units that differ from log to log.
+
     Args:
         where: what is read, to begin the text of errors.
         path: the log, or a folder of several.

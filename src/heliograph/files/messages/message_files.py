@@ -88,7 +88,7 @@ def read_message_file(path: Path) -> Iterator[FileMessage | InputError]:
 def parse_log_line(text: str) -> tuple[str, str, str | None] | None:
     """Return (topic, payload, arrival) of a line that an MQTT client printed; None for any other line.
 
-    The arrival, a date or seconds, is None if the line has none.
+    The arrival, a date or seconds, is None if the line has none. LOGGED is the pattern of such a line.
     """
     match = LOGGED.fullmatch(text.strip())
     return None if match is None else (match["topic"], match["payload"], match["arrival"])
@@ -97,7 +97,8 @@ def parse_log_line(text: str) -> tuple[str, str, str | None] | None:
 def read_log_entry(content: object) -> tuple[str, Any, Any, bool] | None:
     """Return (topic, payload, arrival, was_stored) of a message that a log holds in JSON, or None for other content.
 
-    `was_stored`: the broker had stored the message (MQTT's flag "retain").
+    `was_stored`: the broker had stored the message (MQTT's flag "retain"). TOPIC and PAYLOAD are the fields `topic` and
+    `payload`.
     """
     if not isinstance(content, dict) or not isinstance(content.get(TOPIC), str) or PAYLOAD not in content:
         return None
@@ -211,7 +212,8 @@ def _read_csv_messages(path: Path) -> Iterator[FileMessage | InputError]:
 def convert_cells(row: CsvRow) -> dict[str, Any]:
     """Return {name: value} for the cells of a row: numbers, flags (true, False), None for empty cells, and texts.
 
-    Integers keep every digit. A payload stays a text.
+    Integers keep every digit. A payload stays a text. FLAGS are the words true and false; `parse_number` returns a text
+    that is no number as it is.
     """
     results: dict[str, Any] = {}
     for name, cell in zip(row.header, row.cells, strict=True):

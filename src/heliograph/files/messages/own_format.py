@@ -218,6 +218,8 @@ class HeliographMessageReader:
         A message in our own form has a node, a count, a time and values; the time of arrival, the plant and inputs that
         were set may be in it too. An event is a `Reading` of a node's values, or of inputs. Where the values cannot be
         read, one `Unread` with node, count and time stands for the events, so that the message does not count as lost.
+        Names in capitals are the fields: NODE is "node", INPUTS "inputs", and so on; an event of inputs has INPUTS as
+        its node. NOTHING is an empty array.
 
         Args:
             where: place of the message, for errors.
@@ -258,7 +260,8 @@ class HeliographMessageReader:
     def _check_columns(self, where: str, row: Mapping[str, Any]) -> None:
         """Raise ValueError if a column is unknown, and so most likely misspelt, or if a required one is missing.
 
-        Rows with the same columns as the row before are not checked again.
+        Rows with the same columns as the row before are not checked again. OWN are the fields of our own form, such as
+        `node` (NODE), `sequence` and `time`; the others are named as components.
         """
         if row.keys() == self._columns:
             return
@@ -278,7 +281,9 @@ class HeliographMessageReader:
     def _read_time(self, cell: Any, where: str, column: str) -> tuple[Any, bool]:
         """Return a time and whether it is a date; raise ValueError unless all times are of one kind.
 
-        A date is returned in nanoseconds since 1970, another time as a number.
+        A date is returned in nanoseconds since 1970, another time as a number. `self.numbers` says whether the times so
+        far were numbers, `self._zoned` whether dates had a zone; None before the first. `self.steps`: the network
+        counts steps.
         """
         name = f"{where}, column {column!r}"
         dated = isinstance(cell, str) and looks_like_date(cell)

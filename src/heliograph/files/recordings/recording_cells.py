@@ -88,7 +88,7 @@ def read_cells(columns: Mapping[str, np.ndarray], network: Network, refusals: Ro
     for node, components in received.items():
         found = [_find_column(columns, names, source) for names in components]
         measurements[node] = np.stack([_read_measurements(columns, column, refusals) for column in found], axis=1)
-    # All inputs have to be there, except a time step dt, which follows from the times.
+    # All inputs have to be there, except a time step dt (TIME_STEP), which follows from the times.
     given = {
         name: _read_column_without_gaps(columns, _find_column(columns, (name,), source), refusals)
         for name in inputs

@@ -49,7 +49,8 @@ def order_rows(cells: RecordingRows, network: Network, source: str) -> tuple[Rec
     If time is continuous, a time that is more than a year outside of all others was not set: its row is refused, and
     the other rows are put in the order of their times. If each row is a step, as few rows as possible are refused so
     that times do not go backwards. All rows stay as they are if half of them or more would be refused, or if there is a
-    column `dt`, whose numbers belong to the order of the rows.
+    column `dt`, whose numbers belong to the order of the rows. MOST_OUT is this half, and TIME_STEP the column `dt`,
+    which networks in continuous time have as an input.
 
     Args:
         cells: the rows of a table: times, numbers of the rows, measurements and inputs.

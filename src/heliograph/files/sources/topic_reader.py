@@ -204,7 +204,7 @@ class TopicReader:
             self._last[key] = _LastReading(reading, moment, has_count_changed=False)
             return reading
         is_count_repeated = reading.sequence == last.reading.sequence and last.has_count_changed
-        comes_soon_after = 0 <= moment - last.moment <= COPY
+        comes_soon_after = 0 <= moment - last.moment <= COPY  # ten seconds
         has_same_values = np.array_equal(reading.values, last.reading.values, equal_nan=True)
         if is_count_repeated and comes_soon_after and has_same_values:
             return reading._replace(time=last.reading.time)

@@ -59,7 +59,10 @@ class StoreTable:
 
 
 def _convert_cell(cell: object) -> object:
-    """Return a cell as a message in JSON would have it: dates as text, short decimal numbers as floats."""
+    """Return a cell as a message in JSON would have it: dates as text, short decimal numbers as floats.
+
+    Short are DIGITS (15), which a double gives back.
+    """
     if isinstance(cell, np.datetime64):
         return f"{cell}Z"
     if isinstance(cell, date):  # `datetime` is a `date`, too

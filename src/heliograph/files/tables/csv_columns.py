@@ -248,7 +248,8 @@ class CsvColumnReader:
         """Return a column as dates, as int64 or as floats.
 
         int64 is used if all cells are integers and one reaches EXACT (2^53), from where doubles skip integers. NAT
-        stands for an empty cell among dates and among int64.
+        stands for an empty cell among dates and among int64. WHOLE matches an integer that 64 bits hold, also written
+        as 7.0.
 
         Args:
             name: name of the column; `self._dated` says whether it holds dates.

@@ -127,7 +127,10 @@ def _convert_masked_numbers(values: Any) -> np.ndarray | None:
 
 
 def _make_array(values: Any) -> np.ndarray:
-    """Return a column as a NumPy array; of objects if it is a list with integers that doubles cannot hold."""
+    """Return a column as a NumPy array; of objects if it is a list with integers that doubles cannot hold.
+
+    Doubles hold integers up to EXACT, 2^53.
+    """
     if hasattr(values, "to_numpy"):
         return np.asarray(values.to_numpy())
     if type(values) is np.ndarray and values.dtype.kind == "O":

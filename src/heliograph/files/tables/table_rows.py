@@ -82,6 +82,7 @@ def convert_to_numbers(column: np.ndarray, missing: np.ndarray | None = None) ->
     """Return numbers as float64, or as int64 if integers are too large for exact doubles.
 
     A missing number becomes NaN in float64, and MISSING in int64, which therefore holds no number as small as this.
+    EXACT is 2^53, up to which doubles hold every integer.
 
     Args:
         column: numbers of any type.

@@ -100,7 +100,8 @@ def _format_cells(column: np.ndarray) -> list[str]:
 
     Floats are written by a JSON encoder, which takes a tenth of the time and gives the same digits. The text is
     corrected where Python writes it differently: exponents of one digit, numbers for which only one of the two uses an
-    exponent, NaN and infinity.
+    exponent, NaN and infinity. WITH_EXPONENT and LARGE are the absolute values between which, and from which on, the
+    two differ.
     """
     if column.dtype.kind != "f":
         return list(map(str, _convert_to_plain(column).tolist()))

@@ -108,6 +108,7 @@ class CsvReader:
 
         The list is empty for an empty line, an annotation of Influx and a header, which sets `self.header`. `broken`:
         what is wrong with the line, if this is known already. `self.number` counts the rows behind the header.
+        ANNOTATIONS are the words that begin such a line.
 
         Raises:
             ValueError: the header names no columns, or a column twice.
@@ -180,6 +181,7 @@ def parse_cell(where: str, name: str, cell: str, path: Path | None) -> float:
     """Return the number in a cell: 1 for true and 0 for false, NaN if it is empty or a word for no value (NO_VALUE).
 
     `where` and `name` are the cell's row and column, for the error. `path` is the table's file, if it can be rewritten.
+    FLAGS maps "true" and "false" to their values.
 
     Raises:
         ValueError: the cell holds no number. The error says what is probably meant.

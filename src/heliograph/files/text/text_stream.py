@@ -60,7 +60,8 @@ class TextStream:
     def _may_be_no_text(start: bytes) -> bool:
         """Return whether these first bytes may be the beginning of another kind of file, or of packed text or UTF-16.
 
-        Then more bytes are needed to choose how the text is read.
+        Then more bytes are needed to choose how the text is read. These are the marks GZIP and WIDE, and those of
+        OTHER_KINDS.
         """
         marks = (*OTHER_KINDS, GZIP, *WIDE, codecs.BOM_UTF8)
         return len(start) < len(WIDE[0]) or any(mark.startswith(start) for mark in marks if len(start) < len(mark))

@@ -83,6 +83,7 @@ class MaximumSearch:
 
         Climbs begin at all starts, then at as many points around the best, and near the low end of each interval. In a
         long recording most climbs go most of the way by its first rows; the maximum is one of all rows.
+        SAME_LIKELIHOOD: 1e-6 nats, less than which is no higher top.
 
         Args:
             starts: where to begin (starts, p); from a single one there is a single climb.

@@ -229,7 +229,7 @@ class LikelihoodSurface:
         f(t) = sqrt(2 drop), kept between a distance known to be inside and one known to be outside.
 
         At most MOST_CUTS distances are tried. An end that is not found by then is the last one tried; one that lies
-        beyond `furthest` is infinite.
+        beyond `furthest` is infinite. ACCURACY_OF_FALL is 1e-3, relative.
 
         Args:
             x: the maximum (p,).

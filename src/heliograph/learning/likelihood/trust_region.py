@@ -207,7 +207,7 @@ def _accept_or_reject_steps(
     is below the rounding of l, the gradient decides: the step is accepted if the gradient fell, or if the step went to
     the edge of the region, as across a plateau; and l must not fall by more than rounding. The rounding of l is NOISE
     of its size. After a bad step the radius is NARROWING times the step's length (or the radius, if that is less),
-    after a good one to the edge WIDENING times the old one.
+    after a good one to the edge WIDENING times the old one. LEAST_SHARE_OF_GAIN is 1e-4.
 
     Args:
         state: the climbs before the step, with l (`total`), the radius, and `done` for climbs that go no further.

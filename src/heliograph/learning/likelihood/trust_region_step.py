@@ -93,7 +93,8 @@ def _find_step_within(radius: np.ndarray, g: np.ndarray, b: np.ndarray, d: np.nd
     """Return p = (B + s D^2)^-1 g (climbs, p) with the least shift s >= 0 that keeps |D p| within 1.01 of the radius.
 
     The shift is found by Newton's method for 1 / |D p| = 1 / radius, which is nearly linear in s. It begins at the
-    least s that makes the matrix positive.
+    least s that makes the matrix positive. Eigenvalues above -ROUNDING count as not negative; the first shift lies
+    MARGIN_OF_SHIFT beyond the least one, relative. At most SECULAR_STEPS (20) steps are made.
 
     Args:
         radius: of the trust region (climbs,).

@@ -87,7 +87,7 @@ class Arrivals:
         REGULAR of all intervals are whole multiples of it to NEAR periods. (Losses of a sender that is due in each row
         leave intervals of all lengths.) A median of less than SLOWER rows is no period, unless rows exist because of
         messages (`of_messages`). `clock` has the times as numbers; `declared_period` and `rate.period` count rows,
-        which are `spacing` apart.
+        which are `spacing` apart. Fewer than FEW (8) arrivals tell no period.
         """
         clock = _convert_times_to_numbers(self.time)
         spacing = float(np.median(np.diff(clock))) if len(clock) > 1 else 0.0

@@ -40,7 +40,7 @@ def find_constant_error_between_nodes(
     nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node) and _can_be_joined(node)}
     names = [f"{name}: {output}" for name, node in nodes.items() for output in node.received_names]
     has_centre = any(isinstance(fusion, AbstractFilter) for fusion in network.fused.values())
-    if len(nodes) < 2 or len(names) > MOST or has_centre:
+    if len(nodes) < 2 or len(names) > MOST or has_centre:  # MOST: outputs of which each is tried
         return None
     # Filter of all nodes' measurements (time, all outputs).
     joint = _make_joint_filter(network, nodes)

@@ -219,7 +219,7 @@ class Health:
 
         Each output is judged by itself, since a mean over outputs hides the one that is wrong; all are judged together
         where none is wrong by itself. `health`: the filter's innovations. `test`: of these over all outputs, with their
-        mean square `power` and its standard error.
+        mean square `power` and its standard error. Enough are more than LAGS (10) innovations.
         """
         # `level`: probability of a false alarm that one test may have.
         name = f"{health.node}/{health.filter}"
@@ -263,7 +263,8 @@ class Health:
     def _has_memory(self, health: FilterHealth, test: MemoryTest) -> bool:
         """Return whether innovations predict later ones (by the last one or by several) more than by chance.
 
-        Among N independent numbers, each lag seems to predict 1 / N of the variance.
+        Among N independent numbers, each lag seems to predict 1 / N of the variance. LEAST_SHARE is 1 % of the
+        variance: less is not worth a warning.
         """
         # Gains are optimal for the mean over all possible runs. `expected`: the mean square innovation of this run's
         # gains and losses over that mean. Beyond a factor TYPICAL innovations of a right model are correlated as well.

@@ -92,7 +92,8 @@ def _explain_doubts(network: Network, health: Health, inputs: np.ndarray) -> Hea
     """Return the diagnosis with what may explain doubts: a constant error of an output or node, another unit of time.
 
     A stuck output makes nodes disagree, too; then no constant error between nodes is looked for. `list_doubted_filters`
-    are the trusted ones whose claims the recording contradicts; keys of the errors are (node, filter).
+    are the trusted ones whose claims the recording contradicts; keys of the errors are (node, filter). FALSE:
+    probability with which a right network may be doubted.
     """
     errors = {
         (filter.node, filter.filter): _find_constant_error(network, health, filter, inputs)

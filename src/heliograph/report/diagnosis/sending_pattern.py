@@ -48,7 +48,7 @@ def _find_least_probable_rows(arrived: Bool[np.ndarray, " rows"]) -> Bool[np.nda
     Probabilities are bounds, times the number of patterns that might have been found instead; `least` is the logarithm
     of the least one so far, from CHANCE on. `arrived`: whether a message came in each row (rows,). `_bound_log_chance`
     bounds the log probability that losses in bursts let nothing arrive outside a pattern. CHANCE is 1e-4; up to SHORT
-    (32) rows bursts are looked at in each pattern.
+    (32) rows bursts are looked at in each pattern. Patterns of more than LONGEST (256) rows are not tried.
     """
     # Losses at random, in bursts: a law fitted to the intervals between arrivals.
     arrivals = np.flatnonzero(arrived)

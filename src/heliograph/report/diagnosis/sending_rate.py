@@ -67,7 +67,8 @@ def _find_slowest_rate(arrived: Bool[np.ndarray, " time"]) -> SendingRate | None
     may begin late and fall silent: the rows from its first arrival to its last decide, up to ENOUGH. Then the phases of
     arrivals (row times frequency, less whole periods) lie in a narrow interval, and rows whose phase is in it are due.
     A rate is accepted if losses in bursts would leave all other rows empty with a probability below CHANCE. `slots` of
-    the result numbers the periods of the arrivals from 0.
+    the result numbers the periods of the arrivals from 0. FEWEST is 8 arrivals; N rows distinguish some N values of
+    each of a rate's PARAMETERS (5).
     """
     rows = np.flatnonzero(arrived)
     span = 1 + int(np.ptp(rows)) if len(rows) else 0  # rows from the first arrival to the last
@@ -148,7 +149,7 @@ def _fit_periodic_rows(frequency: float, rows: Int[np.ndarray, " arrivals"], mid
 
     The phase of the arrival in row r is f r - k, with k the number of its period at the given frequency, which is kept.
     Then the width max(phase) - min(phase) is a convex function of f. Its slope is the distance between the rows of the
-    largest and the least phase, so bisection finds the minimum.
+    largest and the least phase, so bisection finds the minimum. STEPS, 18, halve the interval often enough.
 
     Args:
         frequency: an approximate frequency, in periods per row.

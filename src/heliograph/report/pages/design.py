@@ -64,7 +64,10 @@ def make_design_results(results: DesignResults) -> ResultsContent:
 
 
 def write_networks(results: DesignResults, folder: Path) -> None:
-    """Write the original network, and in the same folder the designed one, which reads it."""
+    """Write the original network, and in the same folder the designed one, which reads it.
+
+    SOURCE and DESIGNED are their file names.
+    """
     (folder / SOURCE).write_text(results.source, encoding="utf-8")
     (folder / DESIGNED).write_text(results.written, encoding="utf-8")
 

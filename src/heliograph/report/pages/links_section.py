@@ -89,7 +89,11 @@ def _make_link_cells(health: Health, link: Arrivals) -> list[str]:
 
 
 def _list_refused(health: Health) -> list[Table]:
-    """Return a table of refusals by reason: single readings by limits or filters, and whole messages; [] if none."""
+    """Return a table of refusals by reason: single readings by limits or filters, and whole messages; [] if none.
+
+    A refusal has node, filter ("" for the node's own limits), component, reason, count and first row; WORDS has words
+    for each reason. `refused_messages` counts whole messages by node and reason.
+    """
     rows = []
     names = {
         node: [link.component for link in health.links if link.node == node] for node in health.record.measurements
