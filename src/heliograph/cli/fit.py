@@ -155,7 +155,7 @@ def fit_and_judge(
 def _estimate_losses_by_node(network: "Network", recording: "Recording") -> "dict[str, Losses]":
     """Return the statistics of losses for each node with both arrived and lost messages.
 
-    `fates` are a node's sequences of flags: whether each message arrived.
+    `fates` are a node's sequences of flags: whether each message arrived. `learn_losses` fits laws of losses to them.
     """
     from heliograph.learning.packet_losses.learn_losses import learn_losses
 
@@ -171,7 +171,8 @@ def _find_message_fates(network: "Network", recording: "Recording") -> "dict[str
     """Return which messages of each node arrived, of all that were due, by node or "node.component".
 
     Nodes are left out of which nobody knows when a message is due. Those are nodes without a rate of their own, where
-    each row is a message of one node.
+    each row is a message of one node. `list_arrivals` says of each received number when it arrived: `due` is None if
+    nobody knows when messages are due, and `numbers` are those of the arrived among the due.
     """
     from heliograph.learning.packet_losses.packet_fates import fates_of_measurements, fates_of_sequence
     from heliograph.report.diagnosis.arrivals import list_arrivals
@@ -279,7 +280,8 @@ def _fit_with_progress(
 def collect_results_files(learned: "FitResults", out: Path, network: str) -> "ResultsContent":
     """Return what goes into the results folder `out` of a fit: figures, page, summary, network with the fitted numbers.
 
-    `network` is the network as the user named it, FILE or FILE:NAME.
+    `network` is the network as the user named it, FILE or FILE:NAME. `learned`: the fit, with what filters predict of
+    the rows that were held out.
     """
     from heliograph.files.fitted import as_json, write_fitted
     from heliograph.report.pages.fit import draw_fit_figures, make_page_of_drawings

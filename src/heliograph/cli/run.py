@@ -251,7 +251,8 @@ def _refuse_losing_files(
 ) -> None:
     """Raise ValueError if a file that is read or written would be overwritten.
 
-    `targets` says where estimates go. With a `lag`, lagged estimates are written beside them.
+    `targets` says where estimates go. With a `lag`, lagged estimates are written beside them. `measurements` and the
+    network's file are read, `report` is a folder that is replaced.
     """
     from heliograph.disk.kept_inputs import find_network_file, refuse_replacing
 

@@ -104,7 +104,8 @@ def is_long(path: Path, limit: BlockSize = LONG) -> bool:
 def _check_blocks_suffice(network: "Network", out: Path | StoreAddress | None, others: Iterable[str]) -> None:
     """Raise AllRowsNeededError where options, the output or the network need all rows at once.
 
-    `others`: the options that are given and need all rows. Blocks are written as tables of FORMATS alone.
+    `others`: the options that are given and need all rows. Blocks are written as tables of FORMATS alone. `out`: where
+    estimates go, None for nowhere.
     """
     from heliograph.disk.atomic_files import FORMATS
     from heliograph.fusion.network_fusion import Fusion

@@ -93,7 +93,8 @@ def _list_state_fields(program: StepProgram) -> list[StateField]:
     """Return the members of the state's struct but for the step counter, in order.
 
     A step returns the new value of the member "x" as its result "next_x", of the same type. C has no arrays of length
-    0: an empty one has one number.
+    0: an empty one has one number. `program`: the step as C functions, of which `computes` are those that compute, and
+    `members` the arrays of the state.
     """
     results = program.computes[0].results  # of the whole step, or of the prediction
     types = {result.name.removeprefix("next_"): result.type for result in results}

@@ -131,7 +131,11 @@ def generate_window_code(program: StepProgram, steps: int, state: StructLayout, 
 
 
 def _list_function_heads(window: LateMeasurementWindow, prefix: str, real: Real) -> list[str]:
-    """Return the heads of the window's C functions: its start, a step, and a late measurement (by steps or age)."""
+    """Return the heads of the window's C functions: its start, a step, and a late measurement (by steps or age).
+
+    `window.time`: index of the time step among the inputs, None where time counts steps. `prefix`: with which all names
+    begin.
+    """
     pointer = f"{prefix}_window *window"
     how_late = "uint32_t steps" if window.time is None else f"{real} age"
     return [
@@ -142,7 +146,10 @@ def _list_function_heads(window: LateMeasurementWindow, prefix: str, real: Real)
 
 
 def _declare_window(window: LateMeasurementWindow, prefix: str, real: Real) -> str:
-    """Return the C declarations of two structs: a row (one step), and the window of all rows with its counters."""
+    """Return the C declarations of two structs: a row (one step), and the window of all rows with its counters.
+
+    `prefix`: with which all names begin. `real`: C type of the numbers.
+    """
     received, inputs = max(window.received, 1), max(window.inputs, 1)
     return f"""typedef struct {{
     {prefix}_state before;

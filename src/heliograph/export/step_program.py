@@ -251,7 +251,9 @@ def _find_symmetric_arrays(parts: Sequence[PartOfStep]) -> set[int]:
     """Return the numbers of the state's arrays that are always symmetric, so that one triangle of each is enough.
 
     This is an induction. Arrays that are symmetric at the start are assumed to stay so. Those that a part (prediction
-    or correction) then makes not symmetric are dropped, and the rest is tried again until none is dropped.
+    or correction) then makes not symmetric are dropped, and the rest is tried again until none is dropped. `parts`: the
+    whole step, or prediction and correction, as functions of JAX with example arguments; `_lower_part_to_c` translates
+    one under this assumption, and says of each result whether it is symmetric.
     """
     leaves = parts[0].examples[0]
     symmetric = {n for n, leaf in enumerate(map(np.asarray, leaves)) if _is_symmetric(leaf)}

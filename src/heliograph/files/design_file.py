@@ -106,7 +106,10 @@ def _read_free_transmitters(path: Path, table: Mapping[str, Any]) -> tuple[str, 
 def _read_design_problem(
     path: Path, table: Mapping[str, Any], network: Network, free: tuple[str, ...] | None
 ) -> DesignProblem:
-    """Return the design problem of a network as the content `table` of the design file `path` states it."""
+    """Return the design problem of a network as the content `table` of the design file `path` states it.
+
+    `free`: transmitters whose powers are free, None for all.
+    """
     return DesignProblem(
         network=network,
         free=free,
@@ -124,7 +127,10 @@ def _read_number(path: Path, table: Mapping[str, Any], key: str) -> float | None
 
 
 def _read_budget(path: Path, table: Mapping[str, Any]) -> Budget | None:
-    """Return the budget of powers, or None if the file has none; a plain number limits the total power."""
+    """Return the budget of powers, or None if the file has none; a plain number limits the total power.
+
+    `table`: the content of the design file `path`.
+    """
     value = table.get("budget")
     if value is None:
         return None
@@ -151,7 +157,8 @@ def _read_map_places(path: Path, table: Mapping[str, object]) -> MapPlaces:
 def _find_python_file(path: Path, value: object, key: str) -> tuple[Path, str]:
     """Return the Python file that a value FILE or FILE:NAME names, and NAME, or "" if there is no name.
 
-    FILE is relative to the folder of the design file.
+    FILE is relative to the folder of the design file. `key`: where the value stands in the design file `path`, for
+    errors.
     """
     if not isinstance(value, str):
         raise fail(f"{path.name}, {key}", 'a Python file, as "my_network.py" or "my_network.py:name"', repr(value))

@@ -176,7 +176,8 @@ class DeviceStatuses:
 def _decode_payload(payload: object, where: str) -> object:
     """Return the payload of a status message: decoded if it is JSON, such as {"state": "online"}, else its text.
 
-    A payload that is neither bytes nor text was decoded already, and is returned as it is.
+    A payload that is neither bytes nor text was decoded already, and is returned as it is. `where`: place of the
+    message, for errors.
     """
     if isinstance(payload, bytes):
         payload = payload.decode(errors="replace")

@@ -160,7 +160,8 @@ def note_message(
 def _note_date(topic: TopicStatistics, path: str, value: object, arrival: int | None) -> None:
     """Note a field's value if it is a date (a stamp, text or number): it may be the time of measurement.
 
-    `arrival`: when the message came, in nanoseconds since 1970; None if it is not known.
+    `arrival`: when the message came, in nanoseconds since 1970; None if it is not known. `topic.dates`: by path the
+    times so far, and how late messages came after them.
     """
     is_date = is_stamp(value) or (isinstance(value, str) and looks_like_date(value))
     unit: TimeUnit | None = "s" if is_date else _find_unit_of_date(value)

@@ -84,7 +84,7 @@ def _make_forecast_table(record: Record, name: str, forecast: "heliograph.foreca
     """Return a table with a row for each of at most MOST horizons: its time, then each state and output.
 
     A cell has the mean and the interval that holds 95 %. A forecast has `states` and, unless None, `outputs`, each with
-    names, means and deviations (horizons, numbers).
+    names, means and deviations (horizons, numbers). `record`: the run, whose last row the forecast begins from.
     """
     count = len(forecast.time)
     rows = np.unique(np.linspace(0, count - 1, min(count, MOST)).round().astype(int))

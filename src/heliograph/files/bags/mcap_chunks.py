@@ -60,7 +60,8 @@ def _merge_chunks(
     """Yield the messages of chunks in the order of their times, although chunks may overlap in time.
 
     A message waits while a later chunk may hold an earlier one. Of messages of one time the first in the file comes
-    first.
+    first. `storage`: the open file. `chunks`: groups of records in it, with the time of their first message.
+    `channels`: connections by the numbers of their channels.
     """
     starts = [chunk.message_start_time for chunk in chunks]
     earliest = [*accumulate(reversed(starts), min)][::-1]  # the earliest time of each chunk and all after it

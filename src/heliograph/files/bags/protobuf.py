@@ -236,7 +236,7 @@ def _read_varint(data: bytes, at: int) -> tuple[int, int]:
     """Return the integer that begins at byte `at`, and the byte after its end.
 
     Each byte holds seven bits, the lowest ones first. Its highest bit says that another byte follows. An integer has at
-    most ten bytes, and only its lowest 64 bits count.
+    most ten bytes, and only its lowest 64 bits count. `data`: the bytes.
     """
     number = shift = 0
     for position in range(at, min(at + 10, len(data))):

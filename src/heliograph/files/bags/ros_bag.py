@@ -276,6 +276,8 @@ def list_fields(reader: "AnyReader", kind: str, prefix: str = "", depth: int = 6
     """Yield (dotted path, basic type) of the fields of a message type, down to `depth` messages inside it.
 
     A list has the type "list", and nothing is yielded for its items. A type that the bag does not define has no fields.
+    `kind`: the type. `prefix`: begins the paths. `fielddefs` of the bag has by type its constants and fields: a basic
+    type, a message, or a list.
     """
     from rosbags.interfaces import Nodetype
 

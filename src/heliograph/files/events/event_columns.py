@@ -196,6 +196,7 @@ class NodeEvents:
         """Note events whose stamps are not set (mask `unset`) in `self.unread`: the moments they came, their counts.
 
         If arrivals are not known, the moment is the time of the last earlier event with a stamp, or else of the first.
+        `self.arrays()` are times, arrivals and counts; without known arrivals each arrival is the event's own time.
         """
         time, moments, sequence = self.arrays()
         if not are_arrivals_known:
@@ -222,7 +223,10 @@ def count_missing_messages(time: np.ndarray, sequence: Int[np.ndarray, " events"
 
 
 def node_counts_losses(network: Network, name: str) -> bool:
-    """Return whether a node also receives a number on losses: how many transmissions were lost before its values."""
+    """Return whether a node also receives a number on losses: how many transmissions were lost before its values.
+
+    Such a sender has a trigger that numbers its transmissions.
+    """
     node = network.nodes[name]
     if not isinstance(node, Node) or node.trigger is None or node.trigger.losses != "numbered":
         return False

@@ -191,7 +191,10 @@ def _yield_messages(
 def _read_table_of_own_format(
     path: Path | StoreTable, network: Network, strict: bool, ignore_unknown: bool
 ) -> EventTable:
-    """Return the events of a table in our own form, with the columns node, sequence, time and values."""
+    """Return the events of a table in our own form, with the columns node, sequence, time and values.
+
+    `ignore_unknown`: whether unknown columns are left out. `strict`: whether a row that cannot be read is an error.
+    """
     collector = OwnMessageCollector(network, path, table=True, ignore_unknown=ignore_unknown)
     for message in _yield_messages(path):
         collector.add(message, strict)
@@ -245,7 +248,8 @@ def _read_log(path: Path, table: object, sources: TopicReader, strict: bool) -> 
     """Return the events of a vehicle's log.
 
     `table`: the sources as the user gave them, with what decodes the log (`LogSources`). `sources`: the same, checked
-    against the network.
+    against the network. `strict`: whether a message that cannot be read is an error. `events.notes` gets lines on what
+    was left out.
     """
     events = EventTable(sources.network, sources.step_seconds)
     _append_messages_by_topic(path, read_log(path, table, sources, events.notes), sources, events, strict)

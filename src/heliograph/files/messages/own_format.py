@@ -303,8 +303,9 @@ class HeliographMessageReader:
     def _read_number_of_time(self, cell: Any, name: str, is_step: bool) -> float:
         """Return a time that is a number; a step (`is_step`) must be an integer from 0 on.
 
-        If the first integer is too large for a double (EXACT, 2^53), such as nanoseconds, all times are counted from
-        it (`self.zero`). `self.rounded` is the first time whose difference from it is no exact double.
+        If the first integer is too large for a double (EXACT, 2^53), such as nanoseconds, all times are counted from it
+        (`self.zero`). `self.rounded` is the first time whose difference from it is no exact double. `cell`: the time as
+        it came. `name`: its place, for errors.
         """
         number = _parse_number(cell, name)
         if isinstance(cell, int):

@@ -96,7 +96,8 @@ def read_recording_rows(
     """Read a recording as `read_recording` does; unless `strict`, a row that cannot be read is refused alone.
 
     If the network counts steps, a refused row is a step in which nothing arrived and inputs did not change. Unless
-    `strict`, rows of continuous time are sorted by their times.
+    `strict`, rows of continuous time are sorted by their times. `RowReader` makes a recording of rows and collects what
+    it refuses.
 
     Returns:
         The recording, the reasons why rows were refused, and lines on rows that were sorted.
@@ -139,8 +140,9 @@ def write_recording(recording: Recording, network: Network, path: str | Path) ->
 def _map_headers(network: Network) -> dict[str, str]:
     """Return {header that a column may have: name of the column}.
 
-    A header is the column's name with or without the unit of its state, input or output, as in "range (m)". It may
-    also be in the form in which `write_table` writes names that no cell can hold.
+    A header is the column's name with or without the unit of its state, input or output, as in "range (m)". It may also
+    be in the form in which `write_table` writes names that no cell can hold. `append_unit` puts the unit behind a name
+    that has one.
     """
     received = {node: receiver.received_names for node, receiver in network.nodes.items()}
     names = [*network.states, *network.inputs, *(name for components in received.values() for name in components)]
@@ -212,6 +214,8 @@ class RowReader:
         """Return rows sorted by their times, or as they are if reading is strict.
 
         `self._behind` counts rows that came after later ones. `self.refused` gets the reasons why rows were left out.
+        `cells`: the rows that could be read. `order_rows` returns them sorted, the errors of those left out, and how
+        many came late.
 
         Raises:
             ValueError: a clock of local time was set back by an hour: put in order, rows of two hours would be mixed.

@@ -110,7 +110,10 @@ def list_truth_columns(network: Network) -> dict[str, str]:
 
 
 def list_received_columns(network: Network) -> dict[str, list[tuple[str, ...]]]:
-    """Return for each node, and each component that it receives, the allowed column names, the preferred one first."""
+    """Return for each node, and each component that it receives, the allowed column names, the preferred one first.
+
+    `received_names` are the names of what a node receives.
+    """
     names = {node: receiver.received_names for node, receiver in network.nodes.items()}
     # How many things each name may be meant for: one alone may be called by it without its node.
     uses = Counter([TIME, *network.inputs])
@@ -134,6 +137,7 @@ def _refuse_unknown_columns(columns: Mapping[str, np.ndarray], expected: list[tu
     """Raise a one-line ValueError with the closest known name if a column is not known to the network.
 
     `expected` holds for each state, input or component the names that its column may have, the preferred one first.
+    `columns`: the table's. `source`: its name, for errors.
     """
     known = [name for names in expected for name in names]
     for column in columns:
@@ -145,7 +149,10 @@ def _refuse_unknown_columns(columns: Mapping[str, np.ndarray], expected: list[tu
 
 
 def _find_column(columns: Mapping[str, np.ndarray], names: tuple[str, ...], source: str) -> str:
-    """Return which of these names, all for the same quantity, a column has; raise if no column or several have one."""
+    """Return which of these names, all for the same quantity, a column has; raise if no column or several have one.
+
+    `source`: name of the table, for errors.
+    """
     present = [name for name in names if name in columns]
     if len(present) != 1:
         came = f"both {' and '.join(map(repr, present))}" if present else f"only {', '.join(columns)}"
@@ -154,7 +161,10 @@ def _find_column(columns: Mapping[str, np.ndarray], names: tuple[str, ...], sour
 
 
 def _read_times(columns: Mapping[str, np.ndarray], name: str, refusals: RowRefusals) -> np.ndarray:
-    """Return the times of the rows, as numbers or as dates; rows without a time are refused."""
+    """Return the times of the rows, as numbers or as dates; rows without a time are refused.
+
+    `refusals` notes an error for each such row, or raises the first one where reading is strict.
+    """
     values = np.asarray(columns[name])
     if values.dtype.kind != "M":
         return _read_column_without_gaps(columns, name, refusals)

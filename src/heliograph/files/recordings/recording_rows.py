@@ -140,7 +140,8 @@ def insert_missing_rows(numbers: np.ndarray, network: Network, first: int = 1) -
     """Return the rows with these numbers, and, if every row is a step, also the missing rows between them.
 
     Without an input dt every row is a step, and steps begin with row number `first`. The result holds for each row its
-    number, the index of the last row that was read up to it, and whether the row itself was read.
+    number, the index of the last row that was read up to it, and whether the row itself was read. `network.inputs`:
+    names of the inputs.
     """
     if TIME_STEP in network.inputs or not len(numbers):
         return RowsWithMissing(numbers, np.arange(len(numbers)), np.ones(len(numbers), dtype=bool))

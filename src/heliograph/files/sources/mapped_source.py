@@ -62,7 +62,8 @@ def _check_wildcards(topic: str, source: Source) -> None:
 def _check_time_unit(topic: str, source: Source, time_counts_steps: bool) -> None:
     """Raise ValueError if a source's times are steps and the network's are not, or the other way round.
 
-    Times are steps if the source counts steps, or if it says how many seconds a step has.
+    Times are steps if the source counts steps, or if it says how many seconds a step has. `time_counts_steps`: whether
+    the network counts steps.
     """
     are_steps = source.step is not None or (source.time is not None and source.time_unit == "step")
     if time_counts_steps == are_steps:

@@ -330,7 +330,10 @@ def parse_start(name: str, start: object) -> int:
 
 
 def convert_count(value: Any, name: str, quoted: bool = False) -> int:
-    """Return a running count as an integer; columns of numbers hold it as a float, and if `quoted` it may be a text."""
+    """Return a running count as an integer; columns of numbers hold it as a float, and if `quoted` it may be a text.
+
+    `name`: place of the value, for errors. Numbers of more than 63 bits are refused.
+    """
     if quoted and isinstance(value, str):
         value = parse_number(value)
     value = value.decimal if isinstance(value, LongDecimal) else value

@@ -88,7 +88,10 @@ class TopicClocks:
 
 
 def _find_time_field(topic: str, content: object, sources: Iterable[Source]) -> tuple[str, object]:
-    """Return the path and value of the sources' first time field that the message has, or ("", None)."""
+    """Return the path and value of the sources' first time field that the message has, or ("", None).
+
+    `content`: the message, decoded.
+    """
     for source in sources:
         if source.time is not None:
             with suppress(InputError):

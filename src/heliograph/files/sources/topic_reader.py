@@ -320,7 +320,11 @@ class TopicReader:
 
 
 def _read_names(mapped: MappedSource, topic: str, message: object, where: str) -> tuple[str, str]:
-    """Return the names of a message's plant and node; the plant is "" if there is only one."""
+    """Return the names of a message's plant and node; the plant is "" if there is only one.
+
+    A source gives the node's name itself, or an object whose `of` reads it in the topic or the message, as it does the
+    plant's.
+    """
     source = mapped.source
     node = source.node if isinstance(source.node, str) else source.node.of(topic, message, where)
     plant = "" if source.plant is None else source.plant.of(topic, message, where)

@@ -133,6 +133,8 @@ def _join_flux_rows(address: StoreAddress, rows: Iterable[dict[str, Any]]) -> tu
 def _join_row_with_tags(address: StoreAddress, tags: Row, columns: Row) -> dict[str, Any]:
     """Return {**tags, **columns}: a row's columns with its tags (names and texts that InfluxDB gives a whole series).
 
+    `address`: the store, for errors.
+
     Raises:
         ValueError: a tag and a column have the same name and different values, so that one would be lost.
     """

@@ -215,7 +215,7 @@ class CsvColumnReader:
         """Return the number in a cell, NaN if it is empty.
 
         Unless reading is strict, infinity is an error: it would make the column one of doubles, in which large integers
-        lose their last digits.
+        lose their last digits. `row`, `name`: place of the cell, for errors.
         """
         number = parse_cell(row.where, name, cell, self.path)
         if not self._strict and np.isinf(number):
@@ -236,7 +236,7 @@ class CsvColumnReader:
     def _parse_date(self, row: CsvRow, name: str, cell: str) -> int:
         """Return a date as nanoseconds since 1970; raise if some dates of a column have a time zone and others not.
 
-        `self._zoned` says for each column whether its first date has a zone.
+        `self._zoned` says for each column whether its first date has a zone. `row`, `name`: place of the cell.
         """
         where = f"{row.where}, column {name!r}"
         moment, zoned = parse_moment(cell, where)

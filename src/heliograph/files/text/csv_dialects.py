@@ -95,7 +95,8 @@ def suggest_recoding(path: Path | None, line: str) -> str:
 def guess_meaning_of_cell(cell: str, name: str, path: Path | None) -> str:
     """Return what a cell that is not a number probably means, and the call that rewrites the table; "" if unknown.
 
-    DAY_FIRST matches such a date: day or month, separator, the other.
+    DAY_FIRST matches such a date: day or month, separator, the other. `name`: of its column. `path`: the table's file,
+    None if it cannot be rewritten.
     """
     # In 21.11.2026 and 11/21/2026, the day comes first if it cannot be a month, or if full stops separate the parts.
     if day := DAY_FIRST.fullmatch(cell):

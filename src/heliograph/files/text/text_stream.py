@@ -84,7 +84,8 @@ class TextStream:
     def _unpack_bytes(self, data: bytes, ended: bool) -> bytes:
         """Return the next part, of some AT_ONCE bytes, of what is packed in these bytes and in those that waited.
 
-        Nothing comes after damage, which `self.broken` describes. `ended`: no more bytes will come.
+        Nothing comes after damage, which `self.broken` describes. `ended`: no more bytes will come. `self._packed` has
+        the bytes that waited; `self._in_member` says whether a packed file has begun and not ended.
         """
         packed, results = (self._packed or b"") + data, b""
         try:

@@ -153,7 +153,7 @@ class Objective:
 def _list_code_and_closure(build: Build) -> tuple[object, ...]:
     """Return what makes two functions equal: their code, defaults and the values they close over.
 
-    Any other callable is compared by itself.
+    Any other callable is compared by itself. `build`: the user's function that returns the network.
     """
     if not isinstance(build, FunctionType):
         return (build,)
@@ -190,8 +190,8 @@ def _reuse_equal_objective(objective: Objective) -> Objective:
 def choose_typical_network(description: Description) -> Network:
     """Return the network at its start, or near it if a gain is random there but not at the start itself.
 
-    A gain is random only near the start if its variance is free and starts at 0: for instance a gain that is one of
-    two free values which start equal.
+    A gain is random only near the start if its variance is free and starts at 0: for instance a gain that is one of two
+    free values which start equal. `near_start` is the network a little away from the start.
     """
     start = description.start
     if _has_random_gain(start) or not _has_random_gain(description.near_start):
@@ -214,7 +214,8 @@ def list_forms(description: Description) -> list[Form]:
 
     The linear form uses the unconditional moments of the state, the conditional form those given the data. Models that
     are not linear, or have angles (`circular`), have only the conditional form; packets may then not be late
-    (`link.past`: by how many steps).
+    (`link.past`: by how many steps). `is_linear`: plant and sensor are linear. A random gain is one with a variance
+    that the receiver does not know.
     """
     plant, sensor, channel = join_all_nodes(description.start)
     link = first(channel)  # the channel of the first step, if it varies; its kind is the same at all

@@ -84,7 +84,8 @@ class LikelihoodSurface:
     def evaluations(self, x: Float[np.ndarray, "points p"]) -> Evaluation:
         """Return l, scores and information at each point (points, p); the last result is kept for equal points.
 
-        A search asks at the same points for the value, the gradient and the information one after another.
+        A search asks at the same points for the value, the gradient and the information one after another. `self._last`
+        holds the last points with their evaluation.
         """
         if self._last:
             last_points, last_evaluation = self._last[0]

@@ -321,7 +321,8 @@ def _read_declared_sending(receiver: Any) -> _DeclaredSending:
     """Return what the network says of a node's messages: their period, if they may be lost, and which shares arrive.
 
     The period is in steps, None if none is declared. There is a share for each received number, None if they are not
-    constant.
+    constant. `receiver`: a `Node` behind a channel, or a relay, which says only whether it is `complete`, that is loses
+    nothing.
     """
     if not isinstance(receiver, Node):
         return _DeclaredSending(period=None, may_be_lost=not receiver.complete, shares=None)
@@ -338,7 +339,8 @@ def _find_arrival_probabilities(receiver: Node) -> Float[np.ndarray, " received"
 
     It is also None if the link loses nothing, or if the sender decides when to send. `erases` says whether the channel
     loses components, `remembers` whether losses depend on earlier ones. An outcome has a probability and the mask
-    `arrived` of components.
+    `arrived` of components. `receiver`: the node, with its channel, and its trigger if its sender does not send in each
+    step.
     """
     sends_always = receiver.trigger is None or isinstance(receiver.trigger, Periodic)
     if not sends_always or isinstance(receiver.channel, OverTime):

@@ -162,7 +162,8 @@ class Health:
     def list_doubted_filters(self) -> list[FilterHealth]:
         """Return the filters that the network relies on and whose claims the recording contradicts.
 
-        Filters that use a stuck output are left out: their innovations show only that.
+        Filters that use a stuck output are left out: their innovations show only that. `describe_stuck_outputs` has
+        such outputs by (node, output); `_describe_doubts` yields a sentence for each doubt.
         """
         stuck = {node for node, _ in self.describe_stuck_outputs()}
 
@@ -250,7 +251,8 @@ class Health:
 
         Then their squares are as large as claimed, and they are not correlated in time. `error.white` are these
         innovations over their deviations, (time, m), and `error.squares` the squares, NaN where none came. `judge_size`
-        returns 0 if a mean square, with its standard error, differs from 1 only by chance at `level`.
+        returns 0 if a mean square, with its standard error, differs from 1 only by chance at `level`. `health`: the
+        filter.
         """
         level = self._level_of_one_test() / error.squares.shape[1]
         for squares_of_output in error.squares.T:
@@ -264,7 +266,8 @@ class Health:
         """Return whether innovations predict later ones (by the last one or by several) more than by chance.
 
         Among N independent numbers, each lag seems to predict 1 / N of the variance. LEAST_SHARE is 1 % of the
-        variance: less is not worth a warning.
+        variance: less is not worth a warning. `health`: the filter with its innovations. `test`: their correlations at
+        each lag, with p-values of the first lag and of all, and the share of their variance that is `predictable`.
         """
         # Gains are optimal for the mean over all possible runs. `expected`: the mean square innovation of this run's
         # gains and losses over that mean. Beyond a factor TYPICAL innovations of a right model are correlated as well.
@@ -277,7 +280,8 @@ class Health:
     def _describe_left_out(self, health: FilterHealth) -> Iterator[str]:
         """Yield sentences on outputs of which a filter that weighs outliers down left out many values.
 
-        `heliograph.run` warns in the same words.
+        `heliograph.run` warns in the same words. `output.weighs` says whether the filter weighs outliers down;
+        `summary.describe_left_out` yields the sentences.
         """
         for output in self.outputs:
             if output.weighs and (output.node, output.filter) == (health.node, health.filter):

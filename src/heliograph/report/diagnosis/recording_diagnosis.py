@@ -115,6 +115,8 @@ def _examine_filter(
     is said to be) holds they have variance 1 and no correlation over time, which `test` examines. Both are None for a
     filter that claims no covariance, or receives nothing. `expected`: mean square of `white` that the model expects in
     this recording, which random gains may move from 1. `declared`: tests of noise variances reported with messages.
+    `listener`: the filter, its names, and the measurements that it received. `record`: the run. `inputs` (time,
+    inputs).
     """
     node = listener.node
     name = listener.name
@@ -172,7 +174,8 @@ def _find_constant_error(
     """Return the constant error of an output that explains all or MOST of a filter's doubts, or None.
 
     `explained` is the share of the excess of squared innovations that the error explains; `nothing_else` says that the
-    innovations without its effect are as claimed. None too without a test of the filter's innovations.
+    innovations without its effect are as claimed. None too without a test of the filter's innovations. `judged`: the
+    filter whose innovations are doubted; `health`: the diagnosis so far.
     """
     if judged.test is None:
         return None

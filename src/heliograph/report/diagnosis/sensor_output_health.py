@@ -83,7 +83,7 @@ def _estimate_rmse_errors(record: Record, node: str, name: str, rmse: Mapping[st
     """Return the standard error of each state's RMSE, NaN for an RMSE of 0.
 
     With the mean square M = RMSE^2, to first order it is the standard error of M divided by 2 RMSE. `rmse` holds by
-    state the RMSE of the filter `name` at `node`.
+    state the RMSE of the filter `name` at `node`. `record.errors` are the estimates' errors (rows, n).
     """
     truth = np.asarray(record.truth)
     squares = np.where(np.isnan(truth), np.nan, record.errors(node, name)) ** 2
@@ -365,7 +365,7 @@ def summarise_output(health: OutputHealth) -> dict[str, Json]:
 
     They are of its innovations: mean (bias, with interval), mean square, and mean square over the claimed variance
     (size). If its filter weighs outputs: mean weight, and the share that was weighted down. held: a run of equal
-    readings longer than noise allows.
+    readings longer than noise allows. `health`: the output with its judgement.
     """
     judged, summary = health.judged, health.judged.summary
     values: dict[str, float] = {"bias": summary.bias, "bias_low": summary.bias_low, "bias_high": summary.bias_high,
@@ -383,7 +383,10 @@ def summarise_output(health: OutputHealth) -> dict[str, Json]:
 
 
 def make_output_row(health: OutputHealth) -> dict[str, Json]:
-    """Return one output's names, its numbers, and a text on them."""
+    """Return one output's names, its numbers, and a text on them.
+
+    `health`: the output of a filter with its judgement; `summarise_output` has the numbers.
+    """
     judged = health.judged
     words = str(judged.summary) + ("; to blame" if judged.to_blame else "")
     named: dict[str, Json] = {"node": health.node, "filter": health.filter, "output": judged.output, "words": words}

@@ -120,7 +120,7 @@ def judge_forecasts_of_filters(found: "heliograph.forecasting.Backtest") -> list
     An interval claims to hold a share (SHARES) of what comes. It is a miss if the share that it held differs from the
     claim by more than FAR (3) of its standard errors, and the binomial probability of such a difference (`chance`) is
     also below that of 3 standard errors under a normal law. A filter's `compared` counts its intervals in which
-    anything came.
+    anything came. `found`: the scores of forecasts, by filter, number and horizon.
     """
     verdicts = []
     for name in dict.fromkeys(f"{score.node}/{score.filter}" for score in found.scores):
@@ -233,7 +233,11 @@ def _make_title(verdicts: Sequence[FilterVerdict]) -> str:
 
 
 def _make_score_table(found: "heliograph.forecasting.Backtest") -> Table:
-    """Return all scores, a row for each forecast and horizon, with their standard errors."""
+    """Return all scores, a row for each forecast and horizon, with their standard errors.
+
+    `found`: the scores; a score has node, filter, part (state or output), name, horizon, and means with standard
+    errors.
+    """
     # The RMSE is a root, so its standard error is that of the mean square divided by twice the root.
     rows = [
         [visible(f"{s.node}/{s.filter} {s.part} {s.name}"), str(s.horizon), f"{s.compared:,}",

@@ -122,7 +122,8 @@ def draw_design_figures(results: DesignResults) -> dict[str, Figure]:
 def draw_pareto_front(front: ErrorsOverPower, marks: Mapping[str, tuple[float, float]]) -> Figure:
     """Plot error over total power: the least error found, the proven lower bound, and named points.
 
-    `marks`: {name: (power, error)} of points to mark, at most three.
+    `marks`: {name: (power, error)} of points to mark, at most three. `front`: total powers, with errors and lower
+    bounds.
     """
     figure = Figure(figsize=(WIDTH, 3.4), layout="constrained")
     axes = figure.subplots()
@@ -166,7 +167,10 @@ def draw_powers(before: Mapping[str, float], after: Mapping[str, float]) -> Figu
 
 @matplotlib.rc_context(STYLE)
 def draw_error_map(sites: ErrorsOverSites) -> Figure:
-    """Plot the error over places, darker where it is smaller, with the best place."""
+    """Plot the error over places, darker where it is smaller, with the best place.
+
+    `sites`: places x and y, the errors there, and the best place with its error.
+    """
     figure = Figure(figsize=(WIDTH, 4.6), layout="constrained")
     axes = figure.subplots()
     picture = axes.contourf(sites.x, sites.y, sites.errors, levels=14, cmap="cividis")
@@ -201,7 +205,10 @@ def make_design_page(results: DesignResults, drawings: Mapping[str, bytes]) -> P
 
 
 def _make_headline(results: DesignResults) -> str:
-    """Return the title: how much less or more error and total power the design has than the network as it is."""
+    """Return the title: how much less or more error and total power the design has than the network as it is.
+
+    `results`: the design, whose `present` is the error as the network is, and the powers `before` by transmitter.
+    """
     design, power_now = results.design, sum(results.before.values())
     changes = []
     for what, designed, present in (("error", design.error, design.present), ("power", design.total, power_now)):
@@ -214,7 +221,7 @@ def _make_headline(results: DesignResults) -> str:
 def _make_result_section(results: DesignResults) -> Section:
     """Return the section on the design's error and power, beside those of the present network, and its certificate.
 
-    The certificate is a proven bound: no design has a smaller error.
+    The certificate is a proven bound: no design has a smaller error. `results`: the design, and the powers before it.
     """
     design = results.design
     keys = [
@@ -236,6 +243,7 @@ def _make_powers_section(results: DesignResults, drawings: Mapping[str, bytes]) 
     """Return the section on the powers by transmitter, before and after, and what one more watt saves at each.
 
     `slope`: by transmitter the change of the error for one unit more of its mean power, negative where that helps.
+    `results`: the design, and the powers before it. `drawings`: each figure as SVG.
     """
     after = compute_mean_powers(results.design)
     slope = results.design.sensitivity
@@ -261,7 +269,10 @@ def _make_map_section(drawings: Mapping[str, bytes]) -> Section:
 
 
 def _make_changes_section(results: DesignResults) -> Section:
-    """Return the section on what one more transmitter, relay or place would save."""
+    """Return the section on what one more transmitter, relay or place would save.
+
+    A change has a name, the error of the design made again (`value`), and by how much that is less (`saved`).
+    """
     unit = results.design.certificate.unit
     # The search finds the error to about a thousandth, so a saving is rounded to two digits of that.
     rows = [

@@ -108,7 +108,10 @@ def _list_predicting_nodes(health: Health) -> list[str]:
 
 @matplotlib.rc_context(LOOK)
 def _draw_predicted(health: Health, node: str) -> Figure:
-    """Draw what filters of a node predicted of each number that arrives, with bands and the data, a panel each."""
+    """Draw what filters of a node predicted of each number that arrives, with bands and the data, a panel each.
+
+    `health`: the diagnosis of a run, with the record and the one-step predictions by node and filter.
+    """
     record, filters = health.record, health.predicted[node]
     # By filter mean and deviation of each number that arrives (rows, numbers); and the data (rows, numbers). The fusion
     # centre, which is no key of the measurements, receives the numbers of all nodes.

@@ -87,7 +87,10 @@ def make_results_of_plants(examined: Mapping[str, Health], network: str) -> Resu
 
 
 def _make_overview(examined: Mapping[str, Health], network: str, folders: Mapping[str, str]) -> Page:
-    """Return the page of several plants: how many rows each has and what is doubted there, the most doubted first."""
+    """Return the page of several plants: how many rows each has and what is doubted there, the most doubted first.
+
+    `examined`: the diagnosis of each plant's run. `folders`: the folder of each plant's page.
+    """
     doubts = {plant: health.warnings() for plant, health in examined.items()}
     worst = sorted(examined, key=lambda plant: len(doubts[plant]), reverse=True)
     rows = []
@@ -222,7 +225,10 @@ def run_page(health: Health, network: str, drawings: Mapping[str, bytes]) -> Pag
 
 
 def _make_key_figures(health: Health, doubts: int) -> KeyFigures:
-    """Return the key figures: the number of rows, the share of due messages that arrived, and the number of doubts."""
+    """Return the key figures: the number of rows, the share of due messages that arrived, and the number of doubts.
+
+    A link's `due` is the number of messages that were due (None: unknown), and `share` the share of them that arrived.
+    """
     record = health.record
     shares = [link.share for link in health.links if link.due is not None]
     arrived = f"{np.mean(shares):.1%}" if shares else "–"

@@ -81,6 +81,7 @@ def _find_limits(worth: SensorWorth) -> tuple[float, float]:
     """Return the ends of all panels' axes, a little beyond the bars and with room for their numbers.
 
     A bar goes from 1 to the factor `increase`. SPARE and ROOM are shares of the bars' span, in logarithms.
+    `worth.cases`: the network with a node left out, out for a while, or added.
     """
     increases = np.array([case.increase for case in worth.cases])
     ends_of_bars = np.append(increases[np.isfinite(increases) & (increases > 0)], 1.0)
