@@ -77,7 +77,8 @@ def _make_step_function(filter: AbstractFilter, tree: PyTree, real: str) -> Call
 
     `tree` is the structure of the filter's state, of which C holds the arrays, and `real` the type of numbers in C.
     `judge_step` is the filter's step that also judges its data: `judgement.input` is above 0 if the inputs are
-    implausible.
+    implausible. `is_implausible` compares the innovation with its deviations; `do_inputs_spoil` says whether inputs
+    have too few digits.
     """
 
     @jax.jit

@@ -276,7 +276,7 @@ class EventTable:
             ValueError: the step is not positive.
         """
         laws, unit = {}, 1 if self.numbers else SECOND
-        for name, delays in self.lateness().items():
+        for name, delays in self.lateness().items():  # from measuring to arrival, in seconds or the unit of time
             length = self.step / SECOND if step is None and self.step is not None else step
             if length is None:  # take the median interval; numbers of steps are 1 apart
                 time, _arrival, _sequence = self.columns[name].arrays()

@@ -321,7 +321,8 @@ def _open_frame_reader(path: Path, stack: ExitStack) -> _OpenedFrames:
 def _open_asc(path: Path, stack: ExitStack) -> _OpenedFrames:
     """Open an ASC log, whose frames have seconds since the log's begin; `stack` closes it.
 
-    The date of the begin has no time zone, and is read as UTC on every machine.
+    The date of the begin has no time zone, and is read as UTC on every machine. `_OpenedFrames` has the reader, the
+    log's begin in the reader's times, and what is to be added to these for seconds since 1970.
 
     Raises:
         ValueError: the times are differences between neighbouring events.

@@ -105,6 +105,9 @@ def read_events(
 ) -> EventTable:
     """Return the events of a bag, a log, a file or a folder, or of a store's table; an event is one node's values.
 
+    `TopicReader` checks sources against the network. Each `_read_...` function makes an `EventTable`, which also counts
+    what was refused; `finish` leaves out stamps that were never set.
+
     Args:
         source: path of the recording, or the table of a store.
         network: the network whose nodes the events are of.

@@ -110,7 +110,10 @@ def _has_outputs(outputs: tuple[str, ...], source: Source) -> bool:
 
 
 def _index_outputs(topic: str, source: Source, known: tuple[str, ...]) -> np.ndarray:
-    """Return the index among the `known` outputs of a node for each path of a source."""
+    """Return the index among the `known` outputs of a node for each path of a source.
+
+    A source names the outputs of its paths, or has a path for each output of the node, in their order.
+    """
     outputs = source.outputs or known
     if len(outputs) != len(source.paths):
         expected = f"{len(known)} paths, for {', '.join(known)}, or output="

@@ -344,7 +344,8 @@ def _parse_name_option(name: str, value: object) -> Any:
 def _split_conditions(where: object) -> tuple[Allowed, tuple[Available, ...]]:
     """Return the allowed values by path of a field, and the conditions on what devices say of themselves.
 
-    `where`: as `json_field` takes it: one condition, or several in a list, or None.
+    `where`: one condition or several in a list, or None: {path: allowed value or values}, or `Available` (a device's
+    word).
     """
     conditions = list(where) if isinstance(where, list | tuple) else [] if where is None else [where]
     available = tuple(condition for condition in conditions if isinstance(condition, Available))

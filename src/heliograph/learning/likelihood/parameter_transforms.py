@@ -16,7 +16,7 @@ def map_to_unconstrained(name: str, domain: Domain, value: Float[np.ndarray, "..
 
     A number of an interval becomes v, its logarithm log(v - low) or its logit, as the interval has ends. A simplex
     becomes log(p_i / p_last). A covariance becomes the entries of its Cholesky factor, row after row, with logarithms
-    on the diagonal.
+    on the diagonal. `domain.kind` says which of these it is; an interval goes from `domain.low` to `domain.high`.
 
     Raises:
         ValueError: a start that is not inside the domain.

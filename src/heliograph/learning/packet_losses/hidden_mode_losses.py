@@ -207,7 +207,8 @@ def _stack_matrices(rows: list[list[np.ndarray]]) -> np.ndarray:
 def _rescale_matrices(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return matrices (..., 2, 2) divided by their largest real part, and its logarithm (...).
 
-    Without this, products of many matrices would underflow.
+    Without this, products of many matrices would underflow. `matrix` may be complex, as in derivatives by complex
+    steps.
     """
     largest_of_columns = np.maximum(matrix.real[..., 0, :], matrix.real[..., 1, :])
     largest = np.maximum(largest_of_columns[..., 0], largest_of_columns[..., 1])
