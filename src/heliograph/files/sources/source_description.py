@@ -243,8 +243,9 @@ def json_field(
     sensor a message is of. A path is dotted, with positions in lists as numbers ("pose.pose.position.x", "ranges.3"); a
     field of that very name, dots included, comes first; "" is the message itself.
 
-    A value becomes `scale` value + `offset`; true is 1, false 0; null and numbers that are not finite did not arrive. A
-    time is a date of ISO 8601 with its zone, a stamp of ROS, or a number in `time_unit` since 1970, or since the
+    A value becomes `scale` value + `offset`; true is 1, false 0; null and numbers that are not finite did not arrive.
+
+    A time is a date of ISO 8601 with its zone, a stamp of ROS, or a number in `time_unit` since 1970, or since the
     `start` of its `Stamp`; in the unit "step" it is a step of a network that counts steps. Without `time` a measurement
     is of the moment of its arrival. With `step`, times are counted in steps of so many seconds: each is of the nearest
     step, the first of step 0. A count that is absent is 0, as JSON of protobuf has it; a message that has its count and

@@ -143,14 +143,12 @@ def read_store(url: str) -> dict[str, np.ndarray]:
 
     The scheme of the URL chooses server and transport, what follows `?` says what is read:
 
-    - `influx://host:8086/database?query=SELECT ...` asks InfluxDB in InfluxQL, over HTTP; `influxs://` over TLS.
-    Versions 1, 2 (where a bucket is the database) and 3 answer.
+    - `influx://host:8086/database?query=SELECT ...` asks InfluxDB in InfluxQL, over HTTP; `influxs://` over TLS
+    - `influx://host/database?org=NAME&flux=from(...` asks version 2 in Flux, `?sql=SELECT ...` version 3 in SQL
+    - `postgresql://user@host/database?query=SELECT ...` asks in SQL, in a transaction that only reads
+    - `?table=NAME` in place of a statement reads all of a table, or of a measurement of InfluxDB
 
-    - `influx://host/database?org=NAME&flux=from(...` asks version 2 in Flux, `?sql=SELECT ...` version 3 in SQL.
-
-    - `postgresql://user@host/database?query=SELECT ...` asks in SQL, in a transaction that only reads.
-
-    - `?table=NAME` in place of a statement reads all of a table, or of a measurement of InfluxDB.
+    Versions 1, 2 (where a bucket is the database) and 3 of InfluxDB answer to InfluxQL.
 
     The statement goes to the end of the URL, & included; a % in it is written %25. User and password of InfluxDB, or a
     token alone as password, stand in the URL or in HELIOGRAPH_STORE_USER and HELIOGRAPH_STORE_PASSWORD; those of
