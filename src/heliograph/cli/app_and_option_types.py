@@ -42,7 +42,12 @@ def measured_option(text: str = MEASURED) -> Parameter:
 
 
 def estimates_option() -> Parameter:
-    """Return the declaration of an option that is where estimates go: a file, or the URL of a store."""
+    """Return the declaration of an option that is where estimates go: a file, or the URL of a store.
+
+    Cyclopts, which parses the command line, reads it: the option takes one word (`n_tokens`), has no parts such as
+    --estimates.key (`accepts_keys`), and the converter makes of the word a `Path`, or the address of a store if it is a
+    store's URL.
+    """
     return Parameter(
         help="CSV, Parquet or MCAP to write, or influx:// or postgresql://...?table=: estimates with their claims.",
         converter=_convert_to_path_or_store,

@@ -125,7 +125,10 @@ def _describe_coverage(score: "heliograph.forecasting.Score") -> str:
 
 
 def _make_refit(reference: str, recording: "Recording", advance: "Advance") -> "Callable[[int], Network]":
-    """Return a function from a number of rows to the network whose free numbers are fitted to so many first rows."""
+    """Return a function from a number of rows to the network whose free numbers are fitted to so many first rows.
+
+    `reference`: the network as the user named it, FILE or FILE:NAME.
+    """
     from heliograph.files.fitted import NetworkAgain
 
     # Measurements by node, inputs; NetworkAgain builds the network anew, so that its free numbers can be replaced.

@@ -75,6 +75,11 @@ def _run_command(arguments: Sequence[str] | None) -> int:
 
     These are errors in the arguments, input that cannot be used (InputError), files, and packages that are missing. Any
     other error is a defect of the package and is raised, with its traceback.
+
+    `app` is the command line, by Cyclopts; `bound` are the arguments of the command's function. `_print_refusal` prints
+    the line and returns the status 2.
+
+    FULL are the error numbers of a full disk and such; EXTRAS maps a package to the extra that brings it.
     """
     with suppress(ValueError):  # where the user's home cannot be written to everything is compiled again
         keep_compilations()

@@ -52,7 +52,8 @@ def design(
 def count_stages(file: "DesignFile") -> int:
     """Return the approximate number of steps of `compute_design`, for its progress bar.
 
-    They are the design, the rows of the map, the budgets of the front, and about three changes for each node.
+    They are the design, the rows of the map, the budgets of the front, and about three changes for each node. `file`:
+    the design task, with its network, and map and front if these are asked for.
     """
     from heliograph.planning.design_comparisons import POINTS
 
@@ -65,6 +66,7 @@ def compute_design(file: "DesignFile", advance: "Advance") -> "DesignResults":
 
     That is the powers before, the least error over total powers around the design's own, what changes of the network
     are worth, and a map of the error over sites of a node if the task has one. `advance` is called with the progress.
+    `file`: the task, with its network and problem.
     """
     import heliograph as hg
     from heliograph.files.design_file import make_designed_source

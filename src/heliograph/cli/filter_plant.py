@@ -94,7 +94,8 @@ def write_plant_estimates(
 ) -> list[str]:
     """Write a plant's estimates, and beside them those that use what came up to `lag` later; return lines on these.
 
-    `lag` is in the unit of time; None writes no such estimates.
+    `lag` is in the unit of time; None writes no such estimates. `target`: the file, or the table of a store. `module`:
+    the names in the network's file. `options`: how the data were read.
     """
     write = _make_estimates_writer(plant.data, module)
     predicted = _select_times_of_predictions(plant.predicted, plant.data.rows)
@@ -264,7 +265,8 @@ def _write_lagged_estimates(
 
     Such estimates use messages that come late, but wait no longer than the lag. They are found by replaying the
     messages as they came. Returned is a line for the user; none without a lag, and none for rows of time, which have no
-    order of arrival. `target`: where the estimates are written; `write` writes a table there.
+    order of arrival. `target`: where the estimates are written; `write` writes a table there. `capacity`: rows that the
+    replay holds at a time. `data`: the plant's messages. `options`: how late messages may be.
     """
     if lag is None or data.events is None:
         return []

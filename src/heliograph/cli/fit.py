@@ -98,6 +98,8 @@ def fit_and_judge(
 ) -> "FitResults":
     """Fit the free numbers to the earlier rows; return the fit with what the filters make of the later (held-out) ones.
 
+    `stop.run_unless_stopped(work)` returns what work returns, or None after a signal.
+
     Args:
         network: the network as the user names it, FILE or FILE:NAME.
         measurements: where the data are.
@@ -153,7 +155,7 @@ def fit_and_judge(
 def _estimate_losses_by_node(network: "Network", recording: "Recording") -> "dict[str, Losses]":
     """Return the statistics of losses for each node with both arrived and lost messages.
 
-    `fates` are a node's sequences of flags: whether each message arrived.
+    `fates` are a node's sequences of flags: whether each message arrived. `learn_losses` fits laws of losses to them.
     """
     from heliograph.learning.packet_losses.learn_losses import learn_losses
 
@@ -169,7 +171,8 @@ def _find_message_fates(network: "Network", recording: "Recording") -> "dict[str
     """Return which messages of each node arrived, of all that were due, by node or "node.component".
 
     Nodes are left out of which nobody knows when a message is due. Those are nodes without a rate of their own, where
-    each row is a message of one node.
+    each row is a message of one node. `list_arrivals` says of each received number when it arrived: `due` is None if
+    nobody knows when messages are due, and `numbers` are those of the arrived among the due.
     """
     from heliograph.learning.packet_losses.packet_fates import fates_of_measurements, fates_of_sequence
     from heliograph.report.diagnosis.arrivals import list_arrivals
@@ -277,7 +280,8 @@ def _fit_with_progress(
 def collect_results_files(learned: "FitResults", out: Path, network: str) -> "ResultsContent":
     """Return what goes into the results folder `out` of a fit: figures, page, summary, network with the fitted numbers.
 
-    `network` is the network as the user named it, FILE or FILE:NAME.
+    `network` is the network as the user named it, FILE or FILE:NAME. `learned`: the fit, with what filters predict of
+    the rows that were held out.
     """
     from heliograph.files.fitted import as_json, write_fitted
     from heliograph.report.pages.fit import draw_fit_figures, make_page_of_drawings
@@ -300,10 +304,13 @@ def _convert_comparison_to_json(learned: "FitResults") -> "dict[str, Json]":
     """Return how each filter predicted before and after the fit, and the laws of lost messages by node, for JSON.
 
     Args:
-        learned: results of a fit of a network to a recording: `changes` by filter, and `losses` by node.
+        learned: results of a fit of a network to a recording. `changes` has for each filter its node and name, the
+            `gain` of the log-likelihood per row (`difference` with `standard_error`, or None), and tests of its
+            innovations `before` and `after` (None where there is none). `losses` has for each node the laws of its lost
+            messages.
     """
-    # Each filter, on rows that were not fitted: gain of the log-likelihood per row; "size", the mean square of the
-    # innovations over the claimed one; and "p", the p-value of their whiteness.
+    # Each filter, on rows that were not fitted. "size": the mean square of the innovations over the claimed one
+    # (`power` of their test). "p": the p-value of their whiteness.
     filters: list[Json] = [
         {
             "node": change.node,

@@ -83,6 +83,7 @@ def _collect_topics(recording: str, seconds: float, of_log: "LogSources") -> "tu
         if is_log(path):
             advance(f"reading {recording}")
             return inspect_log(path, of_log)
+        # LINES: the extensions of files with a message a line.
         if path.is_file() and find_extension(path) in (*LINES, ".csv", ".parquet"):
             advance(f"reading {recording}")
             return inspect_file(path)

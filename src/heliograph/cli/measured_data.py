@@ -196,7 +196,8 @@ def read_events(
 def read_rows(path: "Path | StoreTable", network: "Network", options: ReadingOptions) -> MeasuredPlant:
     """Return a table's rows of times as the data of a plant without a name, with warnings on refused rows.
 
-    A warning names at most REASONS reasons.
+    A warning names at most REASONS reasons. `options`: whether an unreadable row is an error, and whether unknown
+    columns are left out. Warnings of the reader are collected as lines.
     """
     from heliograph.files.recordings.recording import read_recording_rows
 

@@ -85,7 +85,8 @@ def _yield_events_of_plants(
 
     The command replays a recording as messages on the standard output. A recording has events (messages), or rows of
     time, which are those of one plant, named "". Warnings and notes go to the standard error. `reference`: the network
-    as the user named it.
+    as the user named it. `options`: how the recording is read. `events_of_recording` makes events of rows, and finds
+    the date.
     """
     from heliograph.disk.quoted_text import visible
     from heliograph.files.network_file import load_module

@@ -251,7 +251,8 @@ def _refuse_losing_files(
 ) -> None:
     """Raise ValueError if a file that is read or written would be overwritten.
 
-    `targets` says where estimates go. With a `lag`, lagged estimates are written beside them.
+    `targets` says where estimates go. With a `lag`, lagged estimates are written beside them. `measurements` and the
+    network's file are read, `report` is a folder that is replaced.
     """
     from heliograph.disk.kept_inputs import find_network_file, refuse_replacing
 
@@ -285,6 +286,8 @@ def _write_report(name: str, network: "Network", plants: "Sequence[FilteredPlant
 
     A record holds the measurements and estimates of a run, and a diagnosis says how plausible both are. `plants` are
     the plants with their records and forecasts, `name` is that of the network, and `report` the folder to write.
+
+    A report of one plant is a page; of several there is an overview, and a folder for each plant.
     """
     from dataclasses import replace
 

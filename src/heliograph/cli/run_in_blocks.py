@@ -82,7 +82,10 @@ def run_in_blocks(
 
 
 def is_long(path: Path, limit: BlockSize = LONG) -> bool:
-    """Return whether a table is too long to be read at once: CSV of too many bytes, or Parquet of too many rows."""
+    """Return whether a table is too long to be read at once: CSV of too many bytes, or Parquet of too many rows.
+
+    `limit`: by default 16 MiB and 262,144 rows.
+    """
     from heliograph.files.text.text_file import find_extension
 
     if not path.is_file():
@@ -101,7 +104,8 @@ def is_long(path: Path, limit: BlockSize = LONG) -> bool:
 def _check_blocks_suffice(network: "Network", out: Path | StoreAddress | None, others: Iterable[str]) -> None:
     """Raise AllRowsNeededError where options, the output or the network need all rows at once.
 
-    `others`: the options that are given and need all rows. Blocks are written as tables of FORMATS alone.
+    `others`: the options that are given and need all rows. Blocks are written as tables of FORMATS alone. `out`: where
+    estimates go, None for nowhere.
     """
     from heliograph.disk.atomic_files import FORMATS
     from heliograph.fusion.network_fusion import Fusion
@@ -128,6 +132,9 @@ def filter_in_blocks(
     most: int = MOST,
 ) -> PrintedLines:
     """Filter the rows of a table and write the estimates, block by block; return what is to be said of it.
+
+    `RecordingBlocks` yields parts of the table as recordings; after the last it has counts and reasons of refused rows,
+    notes and doubts. A `RowsNotInBlocksError` says that only all rows together show their order.
 
     Args:
         network: the network.

@@ -73,6 +73,10 @@ class ServeOptions:
     def settings(self, reference: str) -> "ServiceSettings":
         """Load the network, and return the settings of its service, from the options of the command line.
 
+        `self` has the options: addresses (broker, store, states) as texts, the plants to begin anew, and for several
+        processes that share a store this one's name and the number of parts. Each is parsed here, so that a wrong one
+        is an error before the service begins. With `node`, this process is one node of a fusion between neighbours.
+
         Args:
             reference: the Python file of the network, as FILE or FILE:NAME.
         """
@@ -116,6 +120,9 @@ class ServeOptions:
 
     def _make_state_topics(self) -> "StateTopics | None":
         """Return the topics under which single states are published, by --states and --discovery; None without.
+
+        `self.states`: the broker's URL with the first part of the topics; `self.discovery`: the topic under which home
+        automation looks for devices.
 
         Raises:
             ValueError: an address that is none of MQTT; discovery without one, or a topic that is none.

@@ -93,6 +93,9 @@ class GentleStop:
 
         Nothing changes if a signal came already (`self._number`), or after an earlier call. `self._handlers` keeps the
         earlier handlers.
+
+        It serves a search that has a best result so far: the next signal is to end it gently, which the search asks for
+        (`requested`), and not to raise in the middle of a step.
         """
         if not self._handlers and not self._number:
             self._handlers = {number: signal.getsignal(number) for number in STOPPING}
@@ -122,7 +125,11 @@ class GentleStop:
         return None
 
     def _raise_on_signal(self, number: int, _: FrameType | None) -> NoReturn:
-        """Handle a signal during `run_unless_stopped`: note it, and end the work by KeyboardInterrupt."""
+        """Handle a signal during `run_unless_stopped`: note its number, and end the work by KeyboardInterrupt.
+
+        `run_unless_stopped` catches it, and returns None in place of the work's result; the first signal's number gives
+        the exit code of the command.
+        """
         self._number = self._number or number
         raise KeyboardInterrupt
 

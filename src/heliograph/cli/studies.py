@@ -96,6 +96,9 @@ def run_studies(
 ) -> None:
     """Run studies of a kind one after another, each into its own folder in `out`.
 
+    A study is a module with settings, a `run` that writes its results folder, and a list of packages that it needs;
+    packages offer studies as entry points (`known`).
+
     Args:
         names: names of the studies.
         out: the folder of the results; if it is named `own_folder` it is the study's own.

@@ -145,6 +145,9 @@ def whole_files(paths: Sequence[Path]) -> Iterator[list[Path]]:
     """Yield a temporary file for each of `paths`; at the end they replace `paths` together, or none after an error.
 
     The earlier contents are held in memory meanwhile, so the files should be small.
+
+    A temporary file is hidden beside its path, and has the number of this process in its name; what killed processes
+    left is removed first. Signals such as Ctrl-C wait (`hold_signals`) while files are replaced.
     """
     partials = [path.with_name(f".{path.name}.{os.getpid()}.partial") for path in paths]
     for path in paths:
@@ -264,6 +267,7 @@ def find_foreign_files(folder: Path) -> list[str]:
     """Return the paths in a folder, relative to it and sorted, of files that `whole_folder` did not write as they are.
 
     LISTING holds the checksums of the files that it wrote. What file managers and Python leave behind does not count.
+    `_find_files` returns {relative path: path}.
     """
     listing = folder / LISTING
     try:
@@ -313,6 +317,10 @@ def whole_folder(target: Path) -> Iterator[Path]:
     of killed processes that wrote the same folder are cleared first, and earlier results that such a process had moved
     aside are restored. If somebody else's files came into the old folder meanwhile, it is kept beside the new one, and
     a warning names it.
+
+    The folder that is filled is "new" in a hidden temporary folder beside `target`. `_write_listing` writes the
+    checksums of its files, by which a later run knows them as its own; `_replace_folder` moves the old `target` aside
+    and the new one to its place; `_restore_old_folder` puts the old one back.
     """
     remove_leftover_folders(target)
     made = [folder for folder in target.parents if not folder.exists()]

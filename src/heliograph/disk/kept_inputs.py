@@ -9,6 +9,8 @@ from heliograph.numerics.check import fail
 def refuse_replacing(read: Iterable[object], written: Iterable[object], folder: Path | None = None) -> None:
     """Raise ValueError if a command would overwrite a file that it reads or has just written.
 
+    Paths are compared as they resolve, links followed. The error names the file that would be lost.
+
     Args:
         read: files and folders that the command reads; anything but a path is ignored.
         written: files that the command writes; anything but a path is ignored.

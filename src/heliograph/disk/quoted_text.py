@@ -19,7 +19,10 @@ def quote_for_figure(text: str) -> str:
 
 
 def quote_for_cell(text: str) -> str:
-    """Quote a text for a spreadsheet: what it would compute begins with an apostrophe, which it does not show."""
+    """Quote a text for a spreadsheet: what it would compute begins with an apostrophe, which it does not show.
+
+    A spreadsheet computes a cell that begins with =, +, -, @ or a tab (FORMULA).
+    """
     shown = visible(text)
     return f"'{shown}" if shown.lstrip("'").startswith(FORMULA) else shown
 

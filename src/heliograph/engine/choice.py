@@ -98,6 +98,8 @@ def choose_code(
     Native code is quicker for short functions, but does not take all operations of JAX; XLA, JAX's own compiler, does.
     SETTING is the environment variable that forces one of these engines ("native" or "xla"); "" stands for none.
 
+    The result has `code` (None: XLA computes, for the reason `why`) and `arrays`, the arguments that the code takes.
+
     Args:
         function: a function of the arrays of one run.
         arguments: its arguments.

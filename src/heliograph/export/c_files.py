@@ -115,8 +115,10 @@ def write_filter_files(
 ) -> Exported:
     """Write a filter as two files of C, and return what was written, as `export_c` does for a user's filter.
 
-    `received`: names of the measurement's components, and which of their values are refused; the other arguments are
-    those of `export_c`.
+    `received`: names of the measurement's components, and which of their values are refused.
+
+    `apart`: prediction and correction are functions of their own, too. `size`: small rather than fast. `window`: how
+    many steps late a measurement may be, None for none. `make_c_text` makes the text of both files.
     """
     source = check_source_path(path)
     if precision not in PRECISIONS:
@@ -132,6 +134,8 @@ def write_filter_files(
 
 def check_source_path(path: str | Path) -> Path:
     """Return the checked path of the C source; the file's name is the prefix of the names in it.
+
+    MADE is a text that exported headers have, by which an earlier one may be replaced; RESERVED has the words of C.
 
     Raises:
         ValueError: the file does not end in .c, cannot be written, or has a name that is no name of a C function; the

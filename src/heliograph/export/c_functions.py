@@ -8,7 +8,7 @@ def list_signatures(program: StepProgram, prefix: str, real: Real) -> list[str]:
     """Return the heads of the C functions that move the state: the step, and before it its parts if there are any.
 
     The parts are prediction and correction. If `program.start_at` is not None, a function makes the state from a given
-    mean and covariance.
+    mean and covariance. `prefix`: with which all names begin. `real`: type of the numbers in C.
     """
     state = f"{prefix}_state *state"
     step = f"int {prefix}_step({state}, const {real} z[], const {real} u[])"
@@ -26,6 +26,7 @@ def declare_innovation(program: StepProgram, prefix: str, real: Real) -> str:
     """Return the C declaration of the innovation that a correction tells, or "" if the program has only whole steps.
 
     It holds the innovation's value, any weights, nis (its square over its covariance), and how many components arrived.
+    `prefix`: with which all names begin. `real`: type of the numbers in C.
     """
     if len(program.parts) == 1:
         return ""
@@ -38,7 +39,11 @@ def declare_innovation(program: StepProgram, prefix: str, real: Real) -> str:
 
 
 def explain_separate_functions(program: StepProgram, prefix: str) -> list[str]:
-    """Return lines for the header's comment on prediction, correction and a start as functions of their own."""
+    """Return lines for the header's comment on prediction, correction and a start as functions of their own.
+
+    `program`: the step as C functions; `start_at` is None where the state cannot be set. `prefix`: with which all names
+    begin.
+    """
     lines = [
         "",
         f"{prefix}_step is {prefix}_predict and {prefix}_correct, which may be called apart: predict at each step of",
@@ -64,6 +69,9 @@ def generate_c_functions(program: StepProgram, prefix: str, real: Real) -> list[
     A program whose step is one part gives `step` alone. A program in two parts gives `start_at` (if the state can be
     set), `predict`, `correct`, and `step`, which calls the two. Each function of C returns 0, or the number of a reason
     to refuse its arguments, and writes the state only if it refuses nothing.
+
+    A part is the whole step, or prediction and correction (numbers 0 and 1). `_join_function` puts a head and the lines
+    of its body together.
 
     Args:
         program: the filter's step, translated to statements of C, with the members of its state.
@@ -106,7 +114,10 @@ def _generate_measurement_check(program: StepProgram) -> list[str]:
 
 
 def _generate_inputs_check(program: StepProgram) -> list[str]:
-    """Return the C statements that refuse inputs that are not finite (they return 2), and a step past the end (3)."""
+    """Return the C statements that refuse inputs that are not finite (they return 2), and a step past the end (3).
+
+    `program.filter.horizon`: steps of a model that varies over time, None for any other.
+    """
     lines = [f"    if (!isfinite(u[{i}])) {{ return 2; }}" for i in range(len(program.filter.inputs))]
     if program.filter.horizon is not None:
         lines.append(f"    if (state->step >= {program.filter.horizon}) {{ return 3; }}")
@@ -118,6 +129,10 @@ def _generate_part_statements(program: StepProgram, number: int, prefix: str) ->
 
     All is computed into `after`, a struct like the state, so that a refusal changes nothing. A refusal returns its
     code: 4 the estimate would not be finite, 5 it would lose its digits, 6 the inputs are none.
+
+    `program.read` are the members of the state that a part reads, with their numbers before the first step (`start`),
+    `program.members` those that it writes. `program.mean` names the member with the estimate's mean, and
+    `program.counts` says whether the state counts its steps.
 
     Args:
         program: the step as C functions; `other_results` of a part names results other than the state, such as the
@@ -175,7 +190,8 @@ def _generate_step_number_expression(program: StepProgram, part: PartOfStep) -> 
     """Return the C expression for the number of the step that a part belongs to.
 
     A prediction raises the state's count, so that the correction after it belongs to one less. If all steps of the
-    filter are alike, the state has no count, and the number is 0.
+    filter are alike, the state has no count, and the number is 0. `program`: the step as C functions. `part`: the whole
+    step, the prediction or the correction.
     """
     if not program.counts:
         return "0"
@@ -189,6 +205,7 @@ def _generate_start_statements(program: StepProgram, start: CFunction, prefix: s
 
     It returns 0, or the error code 7 if mean or covariance are invalid: `start`, the C function that makes the state,
     then sets the flag `none` to 1. The new state `after` is copied to the caller's `*state` only if it is valid.
+    `program.members`: the members of the state. `prefix`: with which all names begin.
     """
     members = ", ".join(f"after.{member.name}" for member in program.members)
     return [

@@ -59,6 +59,9 @@ class CText(NamedTuple):
 def generate_header_and_source(program: StepProgram, form: CTextOptions) -> CText:
     """Return header and source of a step in C, with its counts of operations and bytes.
 
+    A field of the state's struct is a C type, a name and a length; `lay_out_array` and `lay_out_struct` return size and
+    alignment in bytes.
+
     Args:
         program: the filter's step, as functions of C, and the arrays of the state (`members`).
         form: the prefix of all names, the C type of numbers (`real`), the names of z's components, a description, and
@@ -91,7 +94,8 @@ def _list_state_fields(program: StepProgram) -> list[StateField]:
     """Return the members of the state's struct but for the step counter, in order.
 
     A step returns the new value of the member "x" as its result "next_x", of the same type. C has no arrays of length
-    0: an empty one has one number.
+    0: an empty one has one number. `program`: the step as C functions, of which `computes` are those that compute, and
+    `members` the arrays of the state.
     """
     results = program.computes[0].results  # of the whole step, or of the prediction
     types = {result.name.removeprefix("next_"): result.type for result in results}
@@ -169,6 +173,9 @@ def find_claim_at_precision(filter: AbstractFilter, real: Real) -> Claim:
 
 def _generate_header_comment(program: StepProgram, form: CTextOptions, window: WindowText) -> str:
     """Return the comment at the head of the header: how to call the functions, and what the arrays hold.
+
+    Lines on functions of their own are there if the program has several parts. MADE marks a header that was exported,
+    by which it may be overwritten later.
 
     Args:
         program: the filter's step, as functions of C.

@@ -57,7 +57,11 @@ def check_and_count_window_steps(filter: AbstractFilter, steps: object) -> int:
     """Return how many steps late a measurement may be, checked.
 
     In continuous time a late measurement splits the interval between two steps. So nothing of the model may count
-    steps, and the prediction over an interval should be that over its two parts: warn if it is not.
+    steps, and the prediction over an interval should be that over its two parts: warn if it is not. `filter.assumed`
+    are plant, sensor, channel and trigger that the filter takes for true, None if it names none;
+    `find_indivisible_part` names a part that counts steps, and `explain_uneven_prediction` says why a prediction over
+    an interval differs from that over its parts. Both return nothing where all is well. TIME_STEP is the input "dt",
+    which only a plant in continuous time has.
 
     Raises:
         ValueError: no positive whole number; a filter in continuous time with a part of its model that counts steps.
@@ -127,7 +131,11 @@ def generate_window_code(program: StepProgram, steps: int, state: StructLayout, 
 
 
 def _list_function_heads(window: LateMeasurementWindow, prefix: str, real: Real) -> list[str]:
-    """Return the heads of the window's C functions: its start, a step, and a late measurement (by steps or age)."""
+    """Return the heads of the window's C functions: its start, a step, and a late measurement (by steps or age).
+
+    `window.time`: index of the time step among the inputs, None where time counts steps. `prefix`: with which all names
+    begin.
+    """
     pointer = f"{prefix}_window *window"
     how_late = "uint32_t steps" if window.time is None else f"{real} age"
     return [
@@ -138,7 +146,10 @@ def _list_function_heads(window: LateMeasurementWindow, prefix: str, real: Real)
 
 
 def _declare_window(window: LateMeasurementWindow, prefix: str, real: Real) -> str:
-    """Return the C declarations of two structs: a row (one step), and the window of all rows with its counters."""
+    """Return the C declarations of two structs: a row (one step), and the window of all rows with its counters.
+
+    `prefix`: with which all names begin. `real`: C type of the numbers.
+    """
     received, inputs = max(window.received, 1), max(window.inputs, 1)
     return f"""typedef struct {{
     {prefix}_state before;
@@ -203,7 +214,8 @@ def _generate_window_functions(window: LateMeasurementWindow, prefix: str, real:
     """Return the text of the window's C functions, made from the templates below.
 
     The names that the templates leave open are the prefix p of all names in C, counts of rows, and statements that
-    depend on the lengths of measurement and inputs.
+    depend on the lengths of measurement and inputs. DIGITS: relative rounding of the type `real`, to which times are
+    compared.
     """
     received, inputs = window.received, window.inputs
     missing = " && ".join(f"(isnan(z[{i}]) != 0)" for i in range(received)) or "1"

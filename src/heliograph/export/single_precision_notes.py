@@ -19,7 +19,7 @@ def explain_ranges(filter: AbstractFilter) -> list[str]:
     """Return a note for each component of z: up to which size rounding is small beside its noise; "" if unknown.
 
     HALF_UNIT is the largest relative error of rounding to single precision. SHARE is the largest share of the noise's
-    deviation that rounding may have.
+    deviation that rounding may have. So the largest size is SHARE (0.01) deviation / HALF_UNIT (2^-24).
     """
     deviations = _find_noise_deviations(filter)
     if deviations is None:
@@ -52,7 +52,9 @@ def _find_noise_deviations(filter: AbstractFilter) -> np.ndarray | None:
     """Return the standard deviation of the noise of each component of z (received,); None of a filter that has none.
 
     The noise of z is M v + n: the sensor's noise v times the link's mean gain M, and the link's own noise n. A filter
-    of which no sensor is known, or whose noise depends on the inputs, says none.
+    of which no sensor is known, or whose noise depends on the inputs, says none. `filter.assumed` are the plant, sensor
+    and channel that the filter takes for true. `second_order` returns the link's mean gain M and its noise as columns
+    with weights.
     """
     assumed = filter.assumed
     sensor = None if assumed is None or assumed.sensor is None else first(assumed.sensor)

@@ -84,6 +84,9 @@ def _make_step_function(
 
     `tree` is the structure of the filter's state, of which C holds the arrays, and `real` the type of numbers in C.
     `leave_out` puts NaN in z in place of numbers that are refused for their value.
+    `judge_step` is the filter's step that also judges its data: `judgement.input` is above 0 if the inputs are
+    implausible. `is_implausible` compares the innovation with its deviations; `do_inputs_spoil` says whether inputs
+    have too few digits.
     """
 
     @jax.jit
@@ -106,6 +109,7 @@ def _make_prediction_function(filter: AbstractFilter, tree: PyTree, real: str) -
     """Return the function of the prediction alone on arrays, from which C is written.
 
     `tree` is the structure of the filter's state, of which C holds the arrays, and `real` the type of numbers in C.
+    `judgement.input` is above 0 if the inputs are implausible.
     """
 
     @jax.jit
@@ -167,6 +171,8 @@ def is_implausible(filter: AbstractFilter, innovation: Innovation, z: jax.Array,
     It is also implausible if one of the filter's angles has too many turns for numbers of type `real`. Each component's
     own deviation is used, since the joint distance would cost more. If the innovation is only of a part of z, such as a
     neighbour's measurement, every component that is so far off counts. A relative difference up to ROUNDING does not.
+    PRECISION maps `real` to NumPy's type, whose relative rounding is `eps`; ROUNDING is 1e-9 for double and 1e-4 for
+    float.
     """
     is_far, difference = Judgement.find_far(innovation), jnp.abs(jnp.asarray(innovation.value))
     if difference.shape == z.shape:

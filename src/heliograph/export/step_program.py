@@ -82,6 +82,9 @@ def lower_step_to_c_functions(
 ) -> StepProgram:
     """Lower one step of a filter from JAX to functions of C; return them with the arrays of the state that they move.
 
+    `_lower_part_to_c` translates a part; `_find_same_result` returns the first array of the state that always equals a
+    given one. `_find_symmetric_arrays` says of which arrays one triangle is enough.
+
     Args:
         filter: the filter.
         real: type of numbers in C.
@@ -212,6 +215,7 @@ def _lower_start_to_c(filter: AbstractFilter, kept: list[int], names: list[str],
     factoring, so that the product of the factors differs from it: this sets the flag.
 
     The results have the names of those of a step, `next_` and the member's, since both write the members of a state.
+    `to_c` translates a function of JAX for arguments like the examples.
 
     Args:
         filter: the filter.
@@ -254,7 +258,9 @@ def _find_symmetric_arrays(parts: Sequence[PartOfStep]) -> set[int]:
     """Return the numbers of the state's arrays that are always symmetric, so that one triangle of each is enough.
 
     This is an induction. Arrays that are symmetric at the start are assumed to stay so. Those that a part (prediction
-    or correction) then makes not symmetric are dropped, and the rest is tried again until none is dropped.
+    or correction) then makes not symmetric are dropped, and the rest is tried again until none is dropped. `parts`: the
+    whole step, or prediction and correction, as functions of JAX with example arguments; `_lower_part_to_c` translates
+    one under this assumption, and says of each result whether it is symmetric.
     """
     leaves = parts[0].examples[0]
     symmetric = {n for n, leaf in enumerate(map(np.asarray, leaves)) if _is_symmetric(leaf)}
@@ -273,7 +279,10 @@ def make_unsupported_error(operation: str, where: str) -> InputError:
 
 
 def name_state_arrays(state: PyTree) -> list[str]:
-    """Return names in C for the arrays of a state, from their field names; the field `gaussian` is left out."""
+    """Return names in C for the arrays of a state, from their field names; the field `gaussian` is left out.
+
+    RESERVED has the words of C, ADDED the members that stand beside the state's arrays.
+    """
     names: list[str] = []
     for path, _ in jax.tree_util.tree_flatten_with_path(state)[0]:
         # Each key of the path is that of an attribute, of a dictionary, or an index in a sequence.

@@ -106,7 +106,10 @@ def _read_free_transmitters(path: Path, table: Mapping[str, Any]) -> tuple[str, 
 def _read_design_problem(
     path: Path, table: Mapping[str, Any], network: Network, free: tuple[str, ...] | None
 ) -> DesignProblem:
-    """Return the design problem of a network as the content `table` of the design file `path` states it."""
+    """Return the design problem of a network as the content `table` of the design file `path` states it.
+
+    `free`: transmitters whose powers are free, None for all.
+    """
     return DesignProblem(
         network=network,
         free=free,
@@ -124,7 +127,10 @@ def _read_number(path: Path, table: Mapping[str, Any], key: str) -> float | None
 
 
 def _read_budget(path: Path, table: Mapping[str, Any]) -> Budget | None:
-    """Return the budget of powers, or None if the file has none; a plain number limits the total power."""
+    """Return the budget of powers, or None if the file has none; a plain number limits the total power.
+
+    `table`: the content of the design file `path`.
+    """
     value = table.get("budget")
     if value is None:
         return None
@@ -132,7 +138,11 @@ def _read_budget(path: Path, table: Mapping[str, Any]) -> Budget | None:
 
 
 def _read_map_places(path: Path, table: Mapping[str, object]) -> MapPlaces:
-    """Return the places of the map that a design file asks for: the network's function of x and y, and the grid."""
+    """Return the places of the map that a design file asks for: the network's function of x and y, and the grid.
+
+    The map shows the error of the network that this function returns for each place of the grid. `values`: the keys
+    network, points, x and y of the table; x and y are the ends of the axes.
+    """
     values = _read_table(path, table, "map")
     file, name = _find_python_file(path, values.get("network"), "map.network")
     if not name:
@@ -147,7 +157,8 @@ def _read_map_places(path: Path, table: Mapping[str, object]) -> MapPlaces:
 def _find_python_file(path: Path, value: object, key: str) -> tuple[Path, str]:
     """Return the Python file that a value FILE or FILE:NAME names, and NAME, or "" if there is no name.
 
-    FILE is relative to the folder of the design file.
+    FILE is relative to the folder of the design file. `key`: where the value stands in the design file `path`, for
+    errors.
     """
     if not isinstance(value, str):
         raise fail(f"{path.name}, {key}", 'a Python file, as "my_network.py" or "my_network.py:name"', repr(value))
@@ -184,7 +195,8 @@ def make_designed_source(file: DesignFile, source: str, powers: Mapping[str, np.
     """Return Python source of a designed network, which loads the original from a file in its own folder.
 
     Args:
-        file: the design file.
+        file: the design file: its problem, whose criterion has horizon and period, and the reference "FILE.py:NAME" of
+            the network that it was made for.
         source: name of the file with the original network.
         powers: the designed powers by transmitter, (steps,) each: of a period or the horizon.
     """

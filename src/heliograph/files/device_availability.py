@@ -39,7 +39,11 @@ class Available:
     path: str = "state"
 
     def __post_init__(self) -> None:
-        """Check the fields, and keep words as tuples in lower case."""
+        """Check the fields, and keep words as tuples in lower case.
+
+        `topic`: where the devices say it. `path`: of the word in an object. `online`, `offline`: the words, compared in
+        lower case.
+        """
         if not isinstance(self.topic, str) or not self.topic or "#" in self.topic:
             raise fail(
                 "Available, topic", "a topic, with + for what that of the values has there", show_value(self.topic)
@@ -117,7 +121,8 @@ class DeviceStatuses:
     def take_status_message(self, topic: str, payload: object, where: str) -> bool:
         """Note a device's word, online or offline, if a message is one; return whether it is.
 
-        An empty message deletes a word that the broker stores, and counts as online.
+        An empty message deletes a word that the broker stores, and counts as online. `self._changed` has the topics
+        whose status must be stored anew.
 
         Args:
             topic: the topic of the message.
@@ -171,7 +176,8 @@ class DeviceStatuses:
 def _decode_payload(payload: object, where: str) -> object:
     """Return the payload of a status message: decoded if it is JSON, such as {"state": "online"}, else its text.
 
-    A payload that is neither bytes nor text was decoded already, and is returned as it is.
+    A payload that is neither bytes nor text was decoded already, and is returned as it is. `where`: place of the
+    message, for errors.
     """
     if isinstance(payload, bytes):
         payload = payload.decode(errors="replace")

@@ -77,13 +77,14 @@ def write_fitted(content: Mapping[str, object], reference: str, measurements: st
         target: the folder's later name. The path to the network's file is relative to it.
     """
     (folder / FITTED).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-    path, colon, name = _split_reference(reference)
+    path, colon, name = _split_reference(reference)  # path is None for MODULE:NAME
     if path is None:
         source = repr(reference)
     else:
         relative = Path(os.path.relpath(path.resolve(), target.resolve())).as_posix()
         source = f"str(HERE / {relative + colon + name!r})"  # quoted, whatever characters the path has
     named = {"network": _quote_in_docstring(reference), "measurements": _quote_in_docstring(measurements)}
+    # The template of a Python file that loads the network and puts the fitted numbers in.
     text = SOURCE.format(**named, fitted=FITTED, file=NETWORK, reference=source)
     (folder / NETWORK).write_text(text, encoding="utf-8")
 

@@ -37,7 +37,11 @@ def load_network(reference: str) -> Network:
 
 
 def load_module(reference: str) -> tuple[Network, Mapping[str, object]]:
-    """Load a network as `load_network` does; return it and {name: value} of its module, such as `sources`, `pose`."""
+    """Load a network as `load_network` does; return it and {name: value} of its module, such as `sources`, `pose`.
+
+    `_call_user_code` makes an error of the user's code one line with its place. `_run_source` runs a file as a module,
+    `_find_network` takes the network out of it.
+    """
     file_path("network", reference)
     source_name, _, name = str(reference).rpartition(":")
     if not source_name or not name.isidentifier():  # no name, or the colon of a drive letter
@@ -122,7 +126,8 @@ def _read_named_network(
 ) -> Network:
     """Return the network that a name of a module stands for, or that the function of this name returns.
 
-    `networks`: those of the module by name, for errors. `file` and `path`: as of `_find_network`.
+    `networks`: those of the module by name, for errors. `file` and `path`: the module's file or name for errors, and
+    the file in which the line of an error is looked for.
     """
     if not hasattr(module, name):
         close = get_close_matches(name, [key for key in vars(module) if not key.startswith("_")], 1)

@@ -12,7 +12,7 @@ def suggest_sources(topics: Mapping[str, TopicStatistics], names: Mapping[str, S
     """Return sources to paste into a network's file: a line for each topic that has numbers.
 
     Args:
-        topics: the topics.
+        topics: by topic what was seen of it: its fields, dates, times of logging and clock.
         names: outputs by node, and the inputs; empty if no network is known.
     """
     lines = [f"# {node}: {', '.join(outputs)}" for node, outputs in names.items()]
@@ -28,6 +28,7 @@ def suggest_sources(topics: Mapping[str, TopicStatistics], names: Mapping[str, S
         options = _suggest_options(topic, dated)
         source = f"hg.files.json_field({fields[0]!r}, node='NODE', output='OUTPUT'{options})"
         lines.append(f"    {name!r}: {source},{_comment_on_unit(topic, fields[0])}")
+        # Beside it the next of the first FEW fields, as comments.
         others = [f"{path}{_comment_on_unit(topic, path, '')}" for path in fields[1:FEW]]
         more = ", ".join(others) + (", ..." if len(fields) > FEW else "")
         if more:

@@ -47,6 +47,9 @@ def inspect_bag(path: Path, progress: Progress | None = None) -> tuple[dict[str,
 def _inspect_one_bag(path: Path, topics: dict[str, TopicStatistics], progress: Progress | None) -> str:
     """Add the topics of one bag of ROS, and return where and why reading it ended early, "" if it did not.
 
+    The statistics of a topic have its type, numeric fields, stamp (`time`), moments of logging and how late messages
+    were logged.
+
     Args:
         path: the bag.
         topics: statistics of topics by name, to which those of the bag are added.

@@ -71,7 +71,8 @@ class TopicStatistics:
 
         It is the first date field whose values differ, or else the first date field. Without dates it is the first
         clock that never goes back. `self.dates` maps a date field to its times, in nanoseconds since 1970, and to how
-        many seconds later messages came.
+        many seconds later messages came. `self.late`: how late messages came after this time; `self.logged`: when they
+        were logged, by this time if nothing else says it.
         """
         if self.time is not None:
             return
@@ -87,6 +88,7 @@ class TopicStatistics:
         """Choose as time the first clock with a number in every message that never goes back, if there is one.
 
         It then also says when messages were logged. If that is known already (`self.logged`), no clock is chosen.
+        `self.clocks` has the numbers of each field that is named as a clock; UNITS maps a unit to its nanoseconds.
         """
         if self.logged:
             return
@@ -133,6 +135,9 @@ def note_message(
 ) -> None:
     """Count a message under its topic; note its numeric fields, and its dates with how late the message came.
 
+    `_yield_leaves` yields (dotted path, value) of all fields. A number that may be a clock from its own start is kept
+    if no arrival is known.
+
     Args:
         topics: the topics by name; a new one is added.
         name: name of the message's topic.
@@ -155,7 +160,8 @@ def note_message(
 def _note_date(topic: TopicStatistics, path: str, value: object, arrival: int | None) -> None:
     """Note a field's value if it is a date (a stamp, text or number): it may be the time of measurement.
 
-    `arrival`: when the message came, in nanoseconds since 1970; None if it is not known.
+    `arrival`: when the message came, in nanoseconds since 1970; None if it is not known. `topic.dates`: by path the
+    times so far, and how late messages came after them.
     """
     is_date = is_stamp(value) or (isinstance(value, str) and looks_like_date(value))
     unit: TimeUnit | None = "s" if is_date else _find_unit_of_date(value)
@@ -177,7 +183,11 @@ def _match_clock_name(path: str) -> re.Match[str] | None:
 
 
 def _read_unit_of_clock_name(path: str) -> Literal["s", "ms", "us", "ns"]:
-    """Return the unit with which a clock's name ends, as in "uptime_ms"; seconds if it has none."""
+    """Return the unit with which a clock's name ends, as in "uptime_ms"; seconds if it has none.
+
+    UNITS are s, ms, us and ns; `_match_clock_name` returns the match of the name's pattern, whose group `unit` is the
+    ending, or None.
+    """
     match = _match_clock_name(path)
     unit = None if match is None else match["unit"]
     return next((known for known in UNITS if known == unit), "s")

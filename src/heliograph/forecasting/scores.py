@@ -161,6 +161,10 @@ def average_overlapping(values: np.ndarray, horizon: int) -> ScoreMean:
     E[d' W d] / 1' S 1, where 1 is the vector of ones; so it is divided by that. A single value has the error NaN.
 
     Source: Newey and West (1987); the number of lags by Lazarus, Lewis, Stock and Watson, HAR inference (2018).
+
+    Args:
+        values: a score of each row's forecast (rows,), NaN where nothing came to compare it with.
+        horizon: h, how many rows ahead the forecasts go.
     """
     came = ~np.isnan(values)
     n = int(came.sum())
@@ -170,12 +174,14 @@ def average_overlapping(values: np.ndarray, horizon: int) -> ScoreMean:
     if n == 1 or not np.isfinite(mean):
         return ScoreMean(mean, float("nan"))
     lags = min(max(horizon - 1, int(BANDWIDTH * n**0.5)), len(values) - 1)
-    # W and S as functions of the lag, and the vector of ones.
+    # W and S as functions of the lag, 1 - lag / count for lags below count; the vector of ones, 0 for values that are
+    # NaN.
     bartlett = _fall_over_lags(lags + 1)
     overlap = _fall_over_lags(horizon)
     one = came.astype(float)
     # E[d' W d] = tr(M W M S) with M = I - 1 1' / n over the rows that are not NaN, which `one` marks by ones:
     # tr(W S) + (1' W 1) (1' S 1) / n^2 - 2 / n 1' W S 1.
+    # `_weigh_neighbours(v, w)` is the product of the matrix of entries w[|i - j|] and the vector v.
     W_one = _weigh_neighbours(one, bartlett)
     S_one = _weigh_neighbours(one, overlap)
     one_W_one, one_S_one = one @ W_one, one @ S_one

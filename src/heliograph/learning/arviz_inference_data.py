@@ -64,7 +64,11 @@ def make_inference_data(solution: Solution, draws: int, seed: int) -> Any:
 
 
 def _evaluate_row_likelihoods(solution: Solution, points: np.ndarray) -> np.ndarray:
-    """Return log p of each row given those before, at unconstrained points, (points, rows of all recordings)."""
+    """Return log p of each row given those before, at unconstrained points, (points, rows of all recordings).
+
+    `evaluate_rows(points).density` is (points, recordings, rows), filled up to the longest recording: `lengths` are the
+    true ones.
+    """
     density = np.asarray(solution.surface.evaluate_rows(points).density)
     return np.concatenate([density[:, i, :steps] for i, steps in enumerate(solution.surface.data.lengths)], axis=1)
 

@@ -115,7 +115,9 @@ class Solution:
     def hessian(self) -> Float[np.ndarray, "r r"]:
         """Hessian of -l along the r identified directions, B' H B with B = `basis`.
 
-        If it is not positive definite, as by rounding, the Gauss-Newton information takes its place.
+        If it is not positive definite, as by rounding, the Gauss-Newton information takes its place. `basis` (active,
+        r) has these directions as columns, in the coordinates of `active` numbers, those not at an end of their domain;
+        `_project_on_identified` multiplies by it from both sides.
         """
         hessian_of_active = self.surface.hessian(self.top.x, self.active)[np.ix_(self.active, self.active)]
         hessian = self._project_on_identified(hessian_of_active)
@@ -141,7 +143,8 @@ class Solution:
     def in_few_stretches(self) -> Bool[np.ndarray, " active"]:
         """Which active coordinates (active,) are real numbers that only a few stretches of the data inform of.
 
-        The scores of such a number, as of a bias after a rare event, do not tell how far its estimate varies.
+        The scores of such a number, as of a bias after a rare event, do not tell how far its estimate varies. Asked is
+        only where the data identify all directions: `rank.flat` (p, directions) has those that they do not.
         """
         free = np.flatnonzero(self.active & self.surface.domains.free)
         in_few_stretches = np.zeros(len(self.active), dtype=bool)
@@ -154,7 +157,8 @@ class Solution:
 
         It is H^-1 J H^-1, with H the Hessian of -l and J the covariance of the sum of scores (gradients of l by row),
         estimated by `method`. Numbers whose information is in a few stretches of the data (`in_few_stretches`) have the
-        model's J.
+        model's J. `basis` (active, r): the identified directions; `scores` are cut to them, and the result brought
+        back.
         """
         scores = self.scores
         by_model = np.zeros((len(self.in_few_stretches), len(self.in_few_stretches)))  # the part of J by the model
@@ -174,7 +178,9 @@ class Solution:
         """Return the table of estimates by this form, with intervals by a method; it is computed at the first call.
 
         Args:
-            method: how intervals are computed, as of `Fit.rows`.
+            method: how intervals are computed: "cosines" and "bartlett" allow for scores that are correlated over time,
+                "white" does not, "hessian" believes the model, "profile" cuts the likelihood, "bootstrap" draws blocks
+                of scores.
             level: probability with which an interval holds the number.
         """
         key = method, level
@@ -191,6 +197,9 @@ class Solution:
         """Return a line for each number: its estimate, and an interval by the expected information at the maximum.
 
         A printed fit shows it where `rows` were not asked for: it needs no derivatives by row.
+
+        `active`: coordinates that are not at an end of their domain. `slopes`: derivatives of each table entry's
+        logarithm or logit by them (entries, active).
         """
         active, values = self.active, self.parameters.entries_at(self.x)
         # A number's variance is g' I^-1 g, with its derivative g, unconstrained too, by the active coordinates.
@@ -227,8 +236,11 @@ class Solution:
     def _make_rows(self, method: Method, level: float) -> tuple[Row, ...]:
         """Return a row for each number of the table: at a boundary, not identified, or with an interval by `method`.
 
+        `active` marks coordinates that are not at an end of their domain; `identifies` says whether the data tell a
+        number with these slopes.
+
         Args:
-            method: how intervals are computed, as of `Fit.rows`.
+            method: how intervals are computed, "cosines", "bartlett", "white", "hessian", "profile" or "bootstrap".
             level: probability with which an interval holds the number.
         """
         covariance, freedom = self.covariance("hessian" if method == "profile" else method)
@@ -262,6 +274,11 @@ class Solution:
         By `method`: estimate +- quantile x standard error, or quantiles of a bootstrap, or where the profile of the
         likelihood has fallen. A logarithm or a logit that is hardly known (by less than a factor of e) has no symmetric
         interval: it is cut out of the profile whatever the method.
+
+        `self.surface.domains.single` marks coordinates with a profile of their own, `self.active` those that are not
+        fixed, and `self.in_few_stretches` the active ones whose information is in a few stretches of the data.
+        `_find_profile_ends` returns the two values at which the profile has fallen by what `level` asks,
+        `_bootstrap_interval` quantiles of the estimate's error.
 
         Args:
             entry: the number.
@@ -316,7 +333,8 @@ class Solution:
         """Return whether the data identify a function f of the numbers: f does not change where l does not (ridges).
 
         `slopes`: df/dx by the active coordinates x. Its component along ridges (`rank.flat`) is at most
-        LARGEST_SHARE_ALONG_RIDGE |df/dx|.
+        LARGEST_SHARE_ALONG_RIDGE |df/dx|. `rank.unit`: standard errors of the coordinates; columns of `rank.flat`:
+        ridges, in units of these.
         """
         scaled_slopes = self.rank.unit * slopes  # in units of each coordinate's standard error
         size = np.linalg.norm(scaled_slopes)
@@ -325,7 +343,8 @@ class Solution:
     def _bootstrap_interval(self, slopes: np.ndarray, level: float) -> np.ndarray:
         """Return both ends of an interval, relative to the estimate, by a bootstrap of blocks of scores.
 
-        A sum of scores moves the maximum by H^-1 times it.
+        A sum of scores moves the maximum by H^-1 times it. `basis`: the r identified directions (active, r), along
+        which H is taken. The draws are sums of blocks of rows' scores, less their mean (draws, r).
 
         Args:
             slopes: derivatives of the number's unconstrained coordinate by the active coordinates (active,).
@@ -339,7 +358,8 @@ class Solution:
         """Return the row of a number at an end of its domain: its interval is from there to one point inside.
 
         At an end 2 * (fall of l) is chi-squared with probability 1/2 and else 0: P(fall > d) = P(chi2 > 2 d) / 2. So an
-        interval of 95 % ends where an ordinary one of 90 % = 2 * 95 % - 1 does.
+        interval of 95 % ends where an ordinary one of 90 % = 2 * 95 % - 1 does. The search for the other end of the
+        interval begins WAY_TO_END inwards, in the coordinate (a logarithm or a logit).
 
         Args:
             entry: the number.
@@ -347,7 +367,7 @@ class Solution:
             level: probability with which the interval holds the number.
         """
         assert entry.coordinate is not None
-        outward = self.top.ends[entry.coordinate]  # -1 or 1
+        outward = self.top.ends[entry.coordinate]  # -1 or 1: the end lies at minus infinity or infinity
         first = np.array([-outward * WAY_TO_END])  # distance inwards at which the search begins
         drop = find_profile_drop(2 * level - 1)
         (end,) = self._find_profile_ends(entry.coordinate, first, drop)
@@ -366,7 +386,9 @@ class Solution:
     def _find_profile_ends(self, coordinate: int, first: np.ndarray, drop: float) -> Float[np.ndarray, " sides"]:
         """Return where the profile likelihood of a coordinate is `drop` nats below its maximum, for each side searched.
 
-        `first` (sides,): signed distances from the maximum at which searches begin; they end at `furthest`.
+        `first` (sides,): signed distances from the maximum at which searches begin; they end at `furthest`. A logarithm
+        or logit is followed for FURTHEST_LOGARITHM (40) steps, a real number for FURTHEST_REAL (1000) times the first
+        distance; an end not found by then is infinite.
         """
         furthest = FURTHEST_REAL * np.abs(first).max() if self.surface.domains.free[coordinate] else FURTHEST_LOGARITHM
         return self.surface.find_profile_crossings(

@@ -105,7 +105,8 @@ class Fit:
         """Test a smaller model with some of the free numbers fixed: 2 (l - l_0) is chi-square if it is true.
 
         l and l_0 are the log-likelihoods of this fit and the smaller one. If a number is fixed at the end of its domain
-        (a variance at 0), the p-value is too large, by a factor of two for one number.
+        (a variance at 0), the p-value is too large, by a factor of two for one number. `best` is the fit in the form
+        that counts, `observations` the number of values that arrived.
 
         Args:
             smaller: the fit of the smaller model.
@@ -201,7 +202,11 @@ class Fit:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """Sentences on starts, boundaries, forms that disagree, and numbers that the data cannot identify."""
+        """Sentences on starts, boundaries, forms that disagree, and numbers that the data cannot identify.
+
+        `solutions`: the maximum of each form of the likelihood; `ends`: log-likelihood at which the climb from each
+        start ended; `identified`: what the data tell of the free numbers, in words.
+        """
         return (
             *describe_unfinished_climbs(self.solutions, self.ends, self.stopped),
             *describe_boundaries(self.best),

@@ -83,6 +83,8 @@ def fit(
     # The likelihood over the free numbers in each form, where to begin, and what the data identify at all.
     surfaces = [LikelihoodSurface(objective, data) for objective in make_objectives(description, truth is not False)]
     points = _choose_starts(surfaces[0], starts, seed)
+    # `identified`: sentences on the numbers that the data do not tell apart, and `ridges`, the number of directions in
+    # which the likelihood does not change; `or_sharper` takes the better known of two such results.
     identified = identify_by_recording(surfaces[-1], points[0], seed)
     # The maximum of each form, and the estimates and intervals in the sentences on what is identified.
     solutions, ends, stopped = _maximise_forms(surfaces, points, seed, identified.ridges, report)
@@ -116,6 +118,9 @@ def _maximise_forms(
 ) -> _FormMaxima:
     """Return the maximum of each form of the likelihood; the first is searched from all starts, the next from its best.
 
+    Returns the solutions, one for each form that was searched; the log-likelihoods at which the climbs of the first
+    form ended; and whether Ctrl-C stopped the search.
+
     Args:
         surfaces: the likelihood in each form: linear (of the best linear filter), conditional (sharper), or one alone.
         points: the starts (starts, p), each p free numbers as coordinates without bounds.
@@ -129,6 +134,8 @@ def _maximise_forms(
     ends = np.zeros(0)
     solutions = list[Solution]()
     for surface in surfaces:
+        # The search keeps its best point so far as `best`, and l at the end of each climb, the highest first, as
+        # `ends`.
         search = MaximumSearch(surface, _make_climb_reporter(surface, progress))
         try:
             top, stopped = search.run(points, seed), False
@@ -203,7 +210,8 @@ def _choose_starts(surface: LikelihoodSurface, count: int, seed: int) -> Float[n
 def _require_information_on_each_number(surface: LikelihoodSurface, points: np.ndarray) -> None:
     """Raise ValueError for a free number of which the data have no information, or no derivative, at all points.
 
-    The estimate of such a number could be anything.
+    The estimate of such a number could be anything. Each number of `own` is the information of one start on this number
+    alone, (starts,).
 
     Args:
         surface: the likelihood over the free numbers.

@@ -138,7 +138,11 @@ class Parameters:
 
     @property
     def entries(self) -> tuple[TableEntry, ...]:
-        """Return the numbers that the table of estimates shows, in its order."""
+        """Return the numbers that the table of estimates shows, in its order.
+
+        An entry has its name, its domain, and the index of its coordinate among all p coordinates; None for entries of
+        a simplex or a covariance, which have none of their own.
+        """
         results, begin = [], 0
         for parameter in self.every:
             has_own_coordinates = parameter.domain.kind == "interval"  # one coordinate for each entry

@@ -116,7 +116,7 @@ def compare_before_and_after(
             old = _predict_rows(old_filter, z, inputs, cut)
             new = _predict_rows(after.nodes[name].filters[key], z, inputs, cut)
             received = ~np.all(np.isnan(old.white), axis=1)  # rows in which anything arrived
-            # Mean gain of log-likelihood in these rows, with its standard error; None with too few rows for a test.
+            # Mean gain of log-likelihood in these rows, with its standard error; None with fewer than LAGS (10) rows.
             gain = None
             if received.sum() >= LAGS:
                 gain = test_zero_mean((new.log_likelihood - old.log_likelihood)[received])
@@ -138,7 +138,8 @@ def transform_held_out(
 
     Args:
         network: the network with the numbers learned.
-        outcome: predictions of the rows from `cut` on, as `compare_before_and_after` returns them.
+        outcome: predictions of the rows from `cut` on, by node and filter, before and after learning, with the whitened
+            innovations of these rows.
         measurements: measurements by node (rows, received).
         inputs: inputs of the plant (rows, inputs).
         cut: number of the first row that was not learned from.
@@ -181,7 +182,7 @@ def _predict_rows(filter: AbstractFilter, z: np.ndarray, u: np.ndarray, cut: int
 
     They are each row's log density, its innovation divided by the predicted deviation, which is white noise if the
     filter is right, and a test of these for correlation over at most LAGS rows. The test is None if there are too few
-    rows.
+    rows. LAGS is 10; `score_innovations` returns both of all rows.
     """
     log_density, whitened = (np.asarray(values)[cut:] for values in score_innovations(filter, z, u))
     lags = min(LAGS, len(whitened) // 10)

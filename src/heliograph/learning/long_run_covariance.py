@@ -22,7 +22,7 @@ def estimate_mean_and_error(values: Float[np.ndarray, " steps"]) -> tuple[float,
 
     Deviations from the mean of the series itself are too small. Of n independent values, the variance that they give
     the sum is too small by the factor (n - 1' W 1 / n) / n, with W the matrix of Bartlett's weights and 1 the vector of
-    ones; so it is divided by that.
+    ones; so it is divided by that. `estimate_by_bartlett` of the ones gives 1' W 1.
     """
     n = len(values)
     if n < 2:

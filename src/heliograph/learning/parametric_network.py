@@ -94,6 +94,8 @@ class _MarkedNumber:
     def __init__(self, start: np.ndarray, name: str | None, kind: Kind | None):
         """Store what the user said of the number; its places are told later by `report`.
 
+        DOMAINS maps a kind to the values that are allowed, its domain.
+
         Args:
             start: value from which a search begins.
             name: its name, or None if the user gave none.
@@ -110,7 +112,7 @@ class _MarkedNumber:
 
         A number may stand in several places, such as one variance in two sensors. A kind that the user gave stays. Two
         intervals are intersected. A check that requires nothing (REAL) changes nothing. Any other domain replaces the
-        known one.
+        known one. A `Domain` of the kind "interval" goes from `low` to `high`.
 
         Args:
             name: name of the argument in whose place the number stands.
@@ -138,7 +140,8 @@ class FreeNumberCollector:
         """Return the start of a number marked `hg.free`, wrapped so that the check of its argument reports its domain.
 
         A checked argument (a variance, a probability) knows which values are allowed: that becomes the number's domain.
-        A name met before means the same number in another place, which must have the same start.
+        A name met before means the same number in another place, which must have the same start. `mark_checked` wraps
+        the start so that the check calls `report` with name and domain of the argument.
 
         Args:
             start: the number's start.
@@ -174,11 +177,16 @@ class ValueReader:
     """Reader that puts values in their places: by name, and in the order of the marks where no name was given."""
 
     def __init__(self, parameters: Parameters, named: tuple[bool, ...], values: Mapping[str, object]):
-        """Store the values, and the names of the numbers that the user did not name, in the order of their marks.
+        """Store the values that are to stand in the places of a network's free numbers.
+
+        The user marks free numbers by `free(...)`, with or without a name, in the function that builds the network.
+        When that function runs again, each mark asks `answer_free` for its value: a named one by its name, one without
+        a name by its turn. So the names that were made up for these are kept in the order of the marks, as an iterator
+        that gives the next one for each mark without a name.
 
         Args:
-            parameters: all free numbers, in the order of their places.
-            named: for each, whether the user gave it a name; the others are found by their order.
+            parameters: all free numbers, in the order in which the function marks them.
+            named: for each, whether the user gave it a name.
             values: the value of each parameter, by its name.
         """
         self.values = values
@@ -188,7 +196,8 @@ class ValueReader:
         """Return the value of the number with this name, or if it is None, of the next number that has no name.
 
         The function that builds the network marks its numbers in the same order each time, so that the next one without
-        a name is known. `start` and `kind` are not used.
+        a name is known. `start` and `kind` are not used. `self.unnamed` yields the names of numbers that the user did
+        not name, in the order of their marks; `self.values` is {name: value}.
         """
         key = next(self.unnamed, "") if name is None else name
         if key not in self.values:
@@ -243,7 +252,8 @@ class Description:
         """Network at a point near the start that is no special case, as where two free gains are equal or one is 0.
 
         It tells whether a gain is random at all, which may not be so at the start itself. If no network can be built on
-        either side of the start, it is the network at the start.
+        either side of the start, it is the network at the start. `at_point` builds the network at unconstrained
+        coordinates. The number IRRATIONAL makes all distances from the start different. DISTANCE_FROM_START is 0.1.
         """
         start = self.parameters.start
         fractions, _ = np.modf(IRRATIONAL * np.arange(1, len(start) + 1))  # different for each number

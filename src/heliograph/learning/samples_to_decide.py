@@ -83,6 +83,7 @@ def samples_to_tell(
     steps = HORIZON if inputs is None else len(np.asarray(inputs))
     u = np.zeros((steps, len(network.inputs))) if inputs is None else np.asarray(inputs, dtype=float)
     # Mean I and long-run deviation sqrt V of the log-likelihood ratio per step, where either law is true.
+    # Channels in which every gain of one of the two laws has the first, and the second.
     channels = [_replace_law(node.channel, (law_a, law_b), law) for law in (law_a, law_b)]
     means = list[float]()
     deviations = list[float]()
@@ -121,7 +122,8 @@ def _find_only_node(network: Network) -> tuple[str, Node]:
 def _replace_law(channel: object, pair: tuple[AbstractLaw, AbstractLaw], law: AbstractLaw) -> AbstractRandomAffine:
     """Return the channel with `law` as the law of the gains in question, for which the `pair` is compared.
 
-    They are those whose law is one of the pair; where there is none, all random gains, if they have one law.
+    They are those whose law is one of the pair; where there is none, all random gains, if they have one law. A channel
+    is a tree, with laws of gains among its leaves; `constant` is None for a random one.
 
     Raises:
         ValueError: a channel that varies over time, or with no random gain, or with several laws, none of the pair.

@@ -127,6 +127,7 @@ def _group_connected_coordinates(bases: list[np.ndarray]) -> list[tuple[int, ...
     """Return the groups of coordinates that flat directions connect, at any point.
 
     `bases`: orthonormal flat directions at each point, in columns. A group of one is a coordinate that no data tell.
+    Entries up to ROUNDING_OF_DIRECTIONS (1e-5) count as 0.
     """
     # An entry of the projector B B' is nonzero if some flat direction moves both coordinates.
     are_connected = np.max([np.abs(B @ B.T) for B in bases], axis=0) > ROUNDING_OF_DIRECTIONS
@@ -143,7 +144,8 @@ def _make_confounded_numbers(
     A combination is identified if it does not change along the flat directions, in which the likelihood has no
     information. These are products prod_i v_i^e_i with whole exponents e, if the same ones are identified at all points
     at which the information was computed; else sums sum_i w_i v_i. `fix` in the result: how many of the numbers must be
-    known so that the others become so.
+    known so that the others become so. Whole are exponents within ROUNDING_OF_EXPONENTS, small those up to
+    LARGEST_EXPONENT (4).
 
     Args:
         group: numbers of the coordinates that flat directions move together.

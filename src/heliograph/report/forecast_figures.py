@@ -64,7 +64,8 @@ def draw_forecasts(
 def make_forecast_tables(record: Record, forecasts: Forecasts) -> list[Table | Text]:
     """Return a text on what is forecast, and then a table for each filter.
 
-    A table has the mean and interval of each state and output at some horizons.
+    A table has the mean and interval of each state and output at some horizons. `forecasts`: by node and filter;
+    `inputs` says what inputs were taken ahead, the same for all.
     """
     any_forecast = next(forecast for filters in forecasts.values() for forecast in filters.values())
     sentence_on_inputs = {
@@ -80,7 +81,11 @@ def make_forecast_tables(record: Record, forecasts: Forecasts) -> list[Table | T
 
 
 def _make_forecast_table(record: Record, name: str, forecast: "heliograph.forecasting.Forecast") -> Table:
-    """Return a table with a row for each of at most MOST horizons: its time, then each state and output."""
+    """Return a table with a row for each of at most MOST horizons: its time, then each state and output.
+
+    A cell has the mean and the interval that holds 95 %. A forecast has `states` and, unless None, `outputs`, each with
+    names, means and deviations (horizons, numbers). `record`: the run, whose last row the forecast begins from.
+    """
     count = len(forecast.time)
     rows = np.unique(np.linspace(0, count - 1, min(count, MOST)).round().astype(int))
     predictions = [("", forecast.states)] + ([] if forecast.outputs is None else [("measured ", forecast.outputs)])

@@ -28,7 +28,8 @@ def group_tested_filters_by_figure(health: Health) -> dict[str, list[FilterHealt
     """Return {name of a figure of innovations: filters that it shows}, of the filters whose innovations are tested.
 
     Up to FEW filters share one figure. More filters get a figure for each node, of MOST nodes at most. `filter.white`
-    are innovations in units of their claim, None for a filter without one.
+    are innovations in units of their claim, None for a filter without one. `health`: the diagnosis of a run, with its
+    filters.
     """
     tested = _sort_fused_first(filter for filter in health.filters if filter.white is not None)
     if len(tested) <= FEW:
@@ -43,7 +44,8 @@ def group_tested_filters_by_figure(health: Health) -> dict[str, list[FilterHealt
 def draw_innovations(health: Health, tested: Sequence[FilterHealth]) -> Figure:
     """Draw the innovations of each filter in `tested` over time, in claimed deviations, a panel each.
 
-    Lines at ±BAND (2) deviations show where 95 of 100 should lie.
+    Lines at ±BAND (2) deviations show where 95 of 100 should lie. `judged.white` are the innovations (time, outputs);
+    `names` has by node the names of its outputs. `health`: the diagnosis of a run, with the record's times.
     """
     figure, grid = make_stacked_panels(len(tested), height=1.5, margin=0.6)
     names = _name_components(health)
@@ -72,7 +74,10 @@ def _choose_colours(count: int, names: Sequence[str]) -> tuple[list[str], list[s
 
 
 def _name_components(health: Health) -> dict[str, list[str]]:
-    """Return the names of the components that each node receives; the centre (FUSED) has "node: component" of all."""
+    """Return the names of the components that each node receives; the centre (FUSED) has "node: component" of all.
+
+    `health`: the diagnosis of a run, with a link for each received number.
+    """
     names: dict[str, list[str]] = {}
     for link in health.links:
         names.setdefault(link.node, []).append(link.component)
@@ -125,7 +130,11 @@ def make_innovations_section(health: Health, drawings: Mapping[str, bytes]) -> S
 
 
 def _make_tests_table(health: Health) -> Table:
-    """Return the table of tests of innovations: size, correlation and p-value of each filter, the fused ones first."""
+    """Return the table of tests of innovations: size, correlation and p-value of each filter, the fused ones first.
+
+    `test` of a filter is None with too few rows, or without a claim: dashes. `power` is the mean square over the claim;
+    correlation and standard error are by lag, the first lag at [0]. `health`: the diagnosis of a run, with its filters.
+    """
     rows = []
     for judged in _sort_fused_first(health.filters):
         cells = ["–", "–", "–"]
@@ -151,7 +160,10 @@ def _sort_fused_first(filters: Iterable[FilterHealth]) -> list[FilterHealth]:
 
 
 def _make_outputs_table(health: Health) -> list[Table]:
-    """Return the table of outputs: bias, size, and how many values weighing filters doubted; [] without outputs."""
+    """Return the table of outputs: bias, size, and how many values weighing filters doubted; [] without outputs.
+
+    `health`: the diagnosis of a run, whose `outputs` have what innovations say of each output.
+    """
     caption = (
         "**Down-weighted**: values that counted less than half, and the interval of their share. **Bias**: median "
         "of the innovations in the output's unit, less that of the law of its noise. **Size**: mean square of the "
@@ -166,7 +178,8 @@ def _make_outputs_table(health: Health) -> list[Table]:
 def _make_output_cells(output: OutputHealth) -> list[str]:
     """Return an output's row of the table: name, received, down-weighted, bias, size, remarks.
 
-    Bias and size have two digits of their standard errors.
+    Bias and size have two digits of their standard errors. `summary` has counts, bias and share of values that the
+    filter weighted down, with intervals; `judged.held` is the run of a stuck value, None if there is none.
     """
     judged, summary = output.judged, output.judged.summary
     doubted = "–"
@@ -186,7 +199,8 @@ def _make_output_cells(output: OutputHealth) -> list[str]:
 def _make_declared_table(health: Health) -> list[Table]:
     """Return the table of what innovations say of noise variances that came with the messages; [] if none came.
 
-    Messages with about the same variance form a class, and each class has a row.
+    Messages with about the same variance form a class, and each class has a row. `health`: the diagnosis of a run,
+    whose `filters` have judgements of such links (`declared`).
     """
     rows = []
     for filter in health.filters:

@@ -16,7 +16,8 @@ def draw_modes_of_nodes(record: Record, kind: str, nodes: Sequence[str]) -> dict
     """Return {file name: figure} of the modes' probabilities, for each node with a filter that estimates modes.
 
     The file name is "modes_KIND_i" with the node's index i in `nodes`; `kind` is "estimates" or "smoothed". The modes
-    are the states of a Markov chain that switches the model.
+    are the states of a Markov chain that switches the model. `record`: the estimates; `modes` are such probabilities,
+    None for a filter without them.
     """
     figures = {}
     for i, node in enumerate(nodes):

@@ -30,7 +30,11 @@ def _show_bar(*more: rich.progress.ProgressColumn) -> Iterator[rich.progress.Pro
 
 @contextmanager
 def progress(stages: int) -> Iterator[Advance]:
-    """Show a progress bar over stages of work; a new name begins the next stage and completes those before."""
+    """Show a progress bar over stages of work; a new name begins the next stage and completes those before.
+
+    The context provides advance(name of the stage, how much of it is done, how much there is). `stages`: how many there
+    are; the bar counts a stage as one.
+    """
     with _show_bar(rich.progress.TimeElapsedColumn()) as bar:
         task = bar.add_task("starting", total=stages)
         stage, begun = "", 0
@@ -137,7 +141,10 @@ def show_countdown(countdown: Countdown) -> Iterator[Callable[[str, int, int], N
 
 @contextmanager
 def show_progress(what: str = "simulating") -> Iterator[Callable[[int, int], None]]:
-    """Show a progress bar with the time left, for `monte_carlo(..., progress=...)`."""
+    """Show a progress bar with the time left, for `monte_carlo(..., progress=...)`.
+
+    `countdown.note` records how much is done, from which the pace follows; `show` draws the bar.
+    """
     countdown = Countdown()
     countdown.note(0)
     with show_countdown(countdown) as show:

@@ -64,7 +64,8 @@ def write_results(
         ValueError: a folder that cannot be written, or that holds something else.
         ModuleNotFoundError: an extra is not installed.
     """
-    # Before the long computation: are the packages there, and may the folder be replaced?
+    # Before the long computation: are the packages there (NEEDS: for figures and pages), and may the folder be
+    # replaced?
     check_installed([*NEEDS, *needs])
     check_replaceable(target)
     # One stage more than the computation's: writing. `whole_folder` gives a temporary folder, which takes the place of
@@ -77,7 +78,11 @@ def write_results(
 
 
 def write_into_folder(results: ResultsContent, folder: Path) -> None:
-    """Write figures, report, data and summary into an existing folder."""
+    """Write figures, report, data and summary into an existing folder.
+
+    `results` has figures by file name, `page` (a function from all figures as SVG to the page), `write_data` (writes
+    other files into the folder) and `summary`, all numbers for JSON.
+    """
     # The SVG pictures come first: drawing them lays the figures out, and the PNG files use this layout.
     from heliograph.report.figures import png, svg
 

@@ -107,6 +107,9 @@ def read_messages(payloads: Sequence[Payload]) -> list[Read]:
     A fast decoder is tried first; what it refuses is read again by one that explains. It reads only times that are
     numbers, so that it is not tried if the time of the first payload is a date.
 
+    A result is the message, an `UnreadMessage` (node, count and time of one that cannot be used, with the reason), or,
+    if not even these can be read, the reason as a text. `_read_or_explain` is the decoder that explains.
+
     Args:
         payloads: lines of JSON, or what was read of them already.
     """

@@ -104,7 +104,8 @@ class MessageLayout:
 
         A bag has many messages of the same layout. Once the byte of each wanted number is known, all of them are read
         at once, without decoding one by one. The bytes are those of CDR, the encoding of ROS 2: each number is aligned
-        to its size. `self._paths`: dotted paths of the wanted numbers.
+        to its size. `self._paths`: dotted paths of the wanted numbers. Lengths of texts and lists are noted too
+        (`_note_length` returns the one that stands at a byte): only messages of the same lengths have this layout.
 
         Args:
             begin: the first byte behind the previous field.
@@ -143,7 +144,8 @@ class MessageLayout:
         """Note the bytes of the wanted numbers among `count` numbers in a row; return the byte after the last.
 
         `names` holds the paths of the numbers. `kind` is their type, such as "uint16", whose size in bytes is in
-        NUMBERS. Every number begins at a multiple of its size.
+        NUMBERS. Every number begins at a multiple of its size. LayoutNotFixedError: the type has no fixed
+        size. `self._paths`: the wanted paths. `self.fields`: {path: (first byte, type)}.
         """
         size = NUMBERS.get(kind)
         if size is None:
@@ -188,6 +190,14 @@ class BatchDecoder:
 
         If it returns False, nothing was appended: the messages have no fixed layout and must be decoded one by one by
         `TopicReader.read`, which gives the same numbers in the same order.
+
+        `self.marked` counts by topic the messages that mark a field as having no value. `NodeReadings` are arrays:
+        index in the batch (`rows`), time, running count and values of each reading, and the `period` after which the
+        count begins at 0 again.
+
+        Args:
+            batch: messages of a bag: topic and type, time of logging, and bytes.
+            table: where the events go.
         """
         try:
             readings, marked = self._read_by_node(batch)
@@ -224,7 +234,7 @@ class BatchDecoder:
         groups = defaultdict[tuple[str, int], list[int]](list)
         for i, message in enumerate(batch):
             groups[message.connection.topic, len(message.data)].append(i)
-        if FEWEST * len(groups) > len(batch):  # too few of a kind to be worth it
+        if FEWEST * len(groups) > len(batch):  # fewer than 5 of a kind on average are not worth it
             raise LayoutNotFixedError
         results = defaultdict[str, list[NodeReadings]](list)
         counts = Counter[str]()
@@ -232,6 +242,7 @@ class BatchDecoder:
             # The messages of one topic and size as bytes, (messages, size).
             table = np.frombuffer(b"".join(batch[i].data for i in members), dtype=np.uint8).reshape(len(members), -1)
             connection = batch[members[0]].connection
+            # Messages of one layout: their rows in the table, and their wanted fields.
             for rows, fields in self._yield_rows_by_layout(connection, table):
                 # Fields by path (messages,), NaN where a flag says that there is no value.
                 columns, marked = blank_columns(connection.msgtype, fields, self._list_judged_paths(topic))
@@ -256,7 +267,9 @@ class BatchDecoder:
     ) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
         """Yield (rows of `table` of one layout, {path: wanted field (rows,)}) until all messages are covered.
 
-        Layouts are kept for later calls, since most messages of a topic have one of a few layouts.
+        Layouts are kept for later calls, since most messages of a topic have one of a few layouts. `self._layouts` has
+        by topic and size the layouts so far; `fits` marks the messages (rows of the table) of one layout, and
+        `read_columns` reads their fields.
 
         Args:
             connection: topic and type of the messages.
@@ -289,6 +302,9 @@ class NodeReadings(NamedTuple):
 
 def _list_paths_of_numbers(source: Source) -> list[str]:
     """Return the dotted paths of the numbers that a source reads: values, both parts of a stamp, and a running count.
+
+    A path is a text, or a value computed from several fields, whose paths `_list_component_paths` lists. STAMP: the
+    names of seconds and nanoseconds.
 
     Raises:
         LayoutNotFixedError: the source's messages must be decoded one by one. Its plant or node stands in the message,
@@ -330,8 +346,8 @@ def _make_node_readings(
     for index, path, scale, offset in zip(indices, source.paths, source.scale, source.offset, strict=True):
         value = _compute_value_column(columns, path)
         values[:, index] = np.where(np.isfinite(value), scale * value + offset, np.nan)
-    # A time stamp of seconds and nanoseconds. 0 means that it was not set. Its seconds must have at most 32 bits, so
-    # that the nanoseconds since 1970 fit into 64.
+    # A time stamp of seconds and nanoseconds (the fields of STAMP); NONE stands for no time. 0 means that it was not
+    # set. Its seconds must have at most 32 bits, so that the nanoseconds since 1970 fit into 64.
     time = np.full(len(rows), NONE)
     if source.time is not None:
         seconds, nanoseconds = (columns[f"{source.time.path}.{field}"] for field in STAMP)
@@ -339,6 +355,7 @@ def _make_node_readings(
         if seconds.dtype.itemsize > 4 or np.any(time == 0):
             raise LayoutNotFixedError
         time += source.time.shift
+    # A running count of the sender's messages; -1 stands for none.
     if source.sequence is None:
         return NodeReadings(rows, time, sequence=np.full(len(rows), -1, dtype=np.int64), values=values, period=0)
     # A count has to be a whole number from 0 on.
@@ -367,7 +384,7 @@ def _compute_value_column(columns: dict[str, np.ndarray], path: str | Computed) 
 def _decode_column(table: np.ndarray, begin: int, kind: str) -> np.ndarray:
     """Return the number of type `kind`, such as "uint16", at byte `begin` of each message, (messages,).
 
-    `table` holds the bytes of messages, (messages, size); numbers are encoded little end first.
+    `table` holds the bytes of messages, (messages, size); numbers are little end first. NUMBERS: bytes of each type.
     """
     column = np.ascontiguousarray(table[:, begin : begin + NUMBERS[kind]])
     return column.view(np.dtype(kind).newbyteorder("<"))[:, 0]
@@ -377,5 +394,7 @@ def _align_to_size(begin: int, size: int) -> int:
     """Return the first byte from `begin` on at which a number of `size` bytes may stand.
 
     CDR aligns a number to a multiple of its size, counted from behind the head of four bytes.
+
+    So begin - 4 is rounded up to a multiple of `size`, and 4 added again. `begin` is 4 or more.
     """
     return 4 + -(-(begin - 4) // size) * size

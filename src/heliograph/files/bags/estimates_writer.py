@@ -85,7 +85,7 @@ class Pose:
 
 def find_pose_states(states: tuple[str, ...]) -> Pose:
     """Return the pose of the states that are named after axes."""
-    axes = (*AXES, *(f"v{axis}" for axis in AXES))
+    axes = (*AXES, *(f"v{axis}" for axis in AXES))  # x, y, z, roll, pitch, yaw, and the same with v for velocities
     return Pose(**{axis: axis for axis in axes if axis in states})
 
 
@@ -110,7 +110,7 @@ def write_bag(record: Record, path: str | Path, origin: np.datetime64 | None = N
     path = Path(path)
     check_writable(path, (".mcap",))
     pose = find_pose_states(record.states) if pose is None else instance("pose", pose, Pose, "a Pose")
-    pose.places(record.states)
+    pose.places(record.states)  # raises ValueError where the pose names a state that is not there
     from rosbags.rosbag2 import StoragePlugin, Writer
 
     store = _load_ros2_message_types()
@@ -122,7 +122,8 @@ def write_bag(record: Record, path: str | Path, origin: np.datetime64 | None = N
         for name, estimate in filters.items()
         for topic, kind in _yield_topics_and_types(_make_topic_prefix(node, name), record.states, estimate.claim, pose)
     }
-    # The writer makes a folder; the file in it is complete in itself.
+    # The writer makes a folder; the file in it is complete in itself. It is moved to `partial`, which gets its final
+    # name when all is written.
     with whole_file(path) as partial, tempfile.TemporaryDirectory(dir=path.parent) as folder:
         bag = Path(folder) / "bag"
         with Writer(bag, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
@@ -142,7 +143,7 @@ def _load_ros2_message_types() -> Any:
 def _convert_times_to_nanoseconds(time: np.ndarray, origin: np.datetime64 | None) -> list[int]:
     """Return times in nanoseconds since 1970, from dates or from seconds after `origin` (1970 if it is None).
 
-    Times that are numbers of steps are taken as seconds.
+    Times that are numbers of steps are taken as seconds. LATEST is 2^31 seconds: later ones have no 32 bits.
 
     Raises:
         ValueError: a time that no stamp of ROS can say.
@@ -174,7 +175,7 @@ def _yield_topics_and_types(
     """Yield (topic, message type) for each part of one filter's estimates: odometry, states and their deviations.
 
     There is odometry if a state is an axis of the pose or twist. There are standard deviations (sd) if the filter
-    claims a covariance.
+    claims a covariance. ODOMETRY and NUMBER are names of message types of ROS.
     """
     axes_of_pose, axes_of_twist = pose.places(states)
     if any(state is not None for state in (*axes_of_pose, *axes_of_twist)):
@@ -235,7 +236,7 @@ def _yield_messages(record: Record, times: list[int], pose: Pose, types: Any) ->
                 odometry = _make_odometry(stamp, estimates.mean[k], claimed, state_indices, pose, types)
                 yield stamp, f"{estimates.prefix}/odometry", odometry
             for topic, number in _yield_state_numbers(estimates, k, record.states):
-                yield stamp, topic, types[NUMBER](number)
+                yield stamp, topic, types[NUMBER](number)  # a message of one number
 
 
 def _yield_state_numbers(estimates: _FilterEstimates, k: int, states: tuple[str, ...]) -> Iterator[tuple[str, float]]:

@@ -47,6 +47,8 @@ def read_messages_in_order(reader: "AnyReader", connections: "Sequence[Connectio
     # One file after another, as a bag in parts was written.
     known = {(connection.topic, connection.msgtype): connection for connection in connections}
     for file in files:
+        # By number of a channel in this file its connection; and the chunks with messages of these, as they lie in the
+        # file. Messages of chunks that overlap in time are merged.
         channels = {c.id: known[c.topic, c.msgtype] for c in file.connections if (c.topic, c.msgtype) in known}
         chunks = [chunk for chunk in file.chunks if any(chunk.channel_count.get(c) for c in channels)]
         yield from _merge_chunks(file, sorted(chunks, key=attrgetter("chunk_start_offset")), channels)
@@ -58,7 +60,8 @@ def _merge_chunks(
     """Yield the messages of chunks in the order of their times, although chunks may overlap in time.
 
     A message waits while a later chunk may hold an earlier one. Of messages of one time the first in the file comes
-    first.
+    first. `storage`: the open file. `chunks`: groups of records in it, with the time of their first message.
+    `channels`: connections by the numbers of their channels.
     """
     starts = [chunk.message_start_time for chunk in chunks]
     earliest = [*accumulate(reversed(starts), min)][::-1]  # the earliest time of each chunk and all after it
@@ -78,6 +81,9 @@ def _yield_messages_of_chunk(
     storage: "McapReader", chunk: "ChunkInfo", channels: "Mapping[int, Connection]"
 ) -> Iterator[RawMessage]:
     """Yield the messages of one chunk, as they stand in it.
+
+    RECORD_HEAD, CHECKSUM and MESSAGE_HEAD are formats of `struct`: kind and length of a record; a checksum; channel,
+    count, and times of logging and publishing of a message. MESSAGE is the kind of a record with a message.
 
     Args:
         storage: the open file.

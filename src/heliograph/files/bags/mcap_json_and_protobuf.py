@@ -82,6 +82,8 @@ def read_mcap_messages(path: Path, sources: TopicReader | None = None) -> Iterat
     with path.open("rb") as file:
         file.seek(len(MAGIC))
         try:
+            # Number, topic with encoding and schema, moment of logging, bytes, and the types of Protocol Buffers so
+            # far.
             for count, channel, logged, data, types in _yield_stored_messages(path, file, sources):
                 # Decode only what the sources read.
                 where = f"{path}, message {count}"
@@ -112,6 +114,10 @@ class _StoredMessage(NamedTuple):
 
 def _yield_stored_messages(path: Path, file: BinaryIO, sources: TopicReader | None) -> Iterator[_StoredMessage]:
     """Yield the messages of an open file in its order; schemas and channels stand before the messages that need them.
+
+    `_read_records` yields kind and content of each record. A channel is a topic with its encoding and the number of its
+    schema; a message record begins with a head (HEADER) that has the channel's number and the moment of logging.
+    `types`: {number of a schema: its message type}, as far as they have come.
 
     Raises:
         ValueError: a topic of the sources in an encoding that is not read.
@@ -163,6 +169,7 @@ def _read_protobuf_schemas(content: bytes) -> dict[int, ProtobufType]:
 
     The answer is {} if the record is damaged or has another encoding than Protocol Buffers. A record consists of the
     schema's number, its name and its encoding (each after its length), and the description of types after its length.
+    NUMBER and LENGTH are formats of `struct`.
     """
     (number,) = NUMBER.unpack_from(content)
     name, end = _read_sized_text(content, NUMBER.size)
@@ -176,7 +183,11 @@ def _read_protobuf_schemas(content: bytes) -> dict[int, ProtobufType]:
 
 
 def _find_channels(file: BinaryIO) -> list[McapChannel]:
-    """Return the channels in the summary of an MCAP file, or, without a summary, those before the first message."""
+    """Return the channels in the summary of an MCAP file, or, without a summary, those before the first message.
+
+    MAGIC stands at both ends of an MCAP file, and the footer before the last one; END is the format of the footer.
+    `_read_records` yields (kind, content) from the present place on.
+    """
     # The footer says where the summary begins; 0 means that there is none.
     file.seek(-END.size - len(MAGIC), os.SEEK_END)
     kind, _length, summary_start, _offsets_start, _checksum = END.unpack(file.read(END.size))
@@ -205,7 +216,8 @@ def _read_records(file: BinaryIO) -> Iterator[tuple[int, bytes]]:
     """Yield kind and content of each record of an MCAP file, up to the end of its data; chunks are unpacked.
 
     A record is one byte for its kind, its size, and its content. A chunk is a record that holds others, compressed:
-    these are yielded in its place.
+    these are yielded in its place. Names in capitals are kinds of records, and formats of `struct`: RECORD for kind and
+    size, PART for the head of a chunk, SIZE for a size. DATA_END and FOOTER are the kinds behind the data.
 
     Raises:
         BagDamagedError: a record that is longer than the rest of the file.
@@ -237,7 +249,8 @@ def _read_channel(content: bytes, types: Mapping[int, ProtobufType]) -> tuple[in
     """Return the number of a channel, and its topic, encoding and schema, from the content of its record.
 
     The record begins with the numbers of the channel and of its schema. `types` maps schemas' numbers to types. If the
-    schema of a Protocol Buffers channel is not among them, its encoding is BARE, which cannot be read.
+    schema of a Protocol Buffers channel is not among them, its encoding is BARE, which cannot be read. NUMBER is a
+    format of `struct`.
     """
     (number,), (schema,) = NUMBER.unpack_from(content), NUMBER.unpack_from(content, NUMBER.size)
     topic, end = _read_sized_text(content, 2 * NUMBER.size)

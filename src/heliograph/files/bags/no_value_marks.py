@@ -70,6 +70,9 @@ def blank_columns(
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Return the columns of many messages with NaN for fields without a value, and which messages have such fields.
 
+    MARKS has by type of message the rules by which ROS says that a field has no value: `covers(path)` says whether a
+    rule is on a field, `is_none(value, flags)` whether it has no value then.
+
     Args:
         kind: type of the messages.
         columns: {path of a field or flag: its numbers (messages,)}.
@@ -90,6 +93,9 @@ def blank_columns(
 
 def blank_message(kind: str, message: Any, paths: Collection[str]) -> bool:
     """Set the fields of a message to NaN that have no value, as the message itself says; return whether there are any.
+
+    MARKS has by type of message the rules by which ROS says that a field has no value: `covers(path)` says whether a
+    rule is on a field, `is_none(value, flags)` whether it has no value then.
 
     Args:
         kind: the type of the message.

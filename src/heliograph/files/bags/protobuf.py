@@ -146,7 +146,8 @@ class ProtobufSchema:
         """Return a message as a dictionary by the names of its fields.
 
         Values of enumerations become their names, a `Timestamp` a dictionary of `sec` and `nsec`, and bytes None. A
-        field that is absent gets its default, if the schema says that absence means the default (`implicit`).
+        field that is absent gets its default, if the schema says that absence means the default (`implicit`). STAMP is
+        the name of the type `Timestamp`.
 
         Args:
             data: the message.
@@ -180,6 +181,8 @@ class ProtobufSchema:
         """Return a field's value as in JSON: a message is an object, an enumeration's value its name, and bytes None.
 
         `depth` counts the messages around this one. `field.of` is the full name of the message's or enumeration's type.
+        A field's kind is a type of message, enumeration, text, bytes, or one of SCALARS, numbers with a function that
+        reads each.
         """
         if field.kind == MESSAGE:
             return self.decode(value, field.of, depth + 1)
@@ -206,7 +209,8 @@ class ProtobufSchema:
 def read_fields(data: bytes) -> Iterator[tuple[int, int, Wire]]:
     """Yield number, wire type and encoded value of each field of a message, as they stand in its bytes.
 
-    The value is an integer for the wire type VARINT, else bytes.
+    The value is an integer for the wire type VARINT, else bytes. LENGTHS has the bytes of the wire types of fixed
+    length; a value of the type SIZED has its length before it.
 
     Raises:
         ValueError: the bytes are no message, or one that was cut off.
@@ -232,7 +236,7 @@ def _read_varint(data: bytes, at: int) -> tuple[int, int]:
     """Return the integer that begins at byte `at`, and the byte after its end.
 
     Each byte holds seven bits, the lowest ones first. Its highest bit says that another byte follows. An integer has at
-    most ten bytes, and only its lowest 64 bits count.
+    most ten bytes, and only its lowest 64 bits count. `data`: the bytes.
     """
     number = shift = 0
     for position in range(at, min(at + 10, len(data))):
@@ -246,6 +250,9 @@ def _read_varint(data: bytes, at: int) -> tuple[int, int]:
 
 def _split_packed(field: FieldDescriptor, wire: int, value: Wire) -> list[Wire]:
     """Return the encoded values of a field: one, or several for a packed list, whose values share one block of bytes.
+
+    VARINT is an integer of as many bytes as it needs, SIZED a block of bytes; LENGTHS has the bytes of the other wire
+    types.
 
     Args:
         field: the field, as the schema declares it.
@@ -277,7 +284,8 @@ def _split_packed(field: FieldDescriptor, wire: int, value: Wire) -> list[Wire]:
 def _find_wire_type(field: FieldDescriptor) -> int:
     """Return a field's wire type, which says how its value is laid out; raise ValueError if its type is not read.
 
-    SIZED: the value's length stands before it. VARINT: an integer that takes as many bytes as it needs.
+    SIZED: the value's length stands before it. VARINT: an integer that takes as many bytes as it needs. SCALARS has the
+    wire type of each kind of number.
     """
     if field.kind in (TEXT, BYTES, MESSAGE):
         return SIZED

@@ -84,7 +84,8 @@ def read_bag(
             expected = f"a topic of the sources, {_join_names(sources.topics)}"
             raise fail(f"{path}", expected, f"only {_join_names(counts)}")
         _check_fields_of_sources(path, reader, sources)
-        # Decode the messages of a batch all at once if their layouts allow it, else one after another.
+        # Decode the messages of a batch all at once if their layouts allow it (else `append_events` returns False), or
+        # one after another.
         total = sum(counts[topic] for topic in used)
         done = 0
         decoder = BatchDecoder(reader, sources)
@@ -203,7 +204,8 @@ def read_raw_messages(path: Path, reader: "AnyReader", topics: list[str]) -> Ite
 def group_into_batches(messages: Iterator[RawMessage]) -> Iterator[list[RawMessage]]:
     """Yield messages in lists of at most OFTEN messages, which end once they have LARGE bytes.
 
-    If reading fails, the messages before the failure are yielded first, and the error is raised then.
+    If reading fails, the messages before the failure are yielded first, and the error is raised then. A batch is
+    decoded all at once; its size bounds the memory.
     """
     batch, size, failure = list[RawMessage](), 0, None
     while failure is None:
@@ -274,6 +276,8 @@ def list_fields(reader: "AnyReader", kind: str, prefix: str = "", depth: int = 6
     """Yield (dotted path, basic type) of the fields of a message type, down to `depth` messages inside it.
 
     A list has the type "list", and nothing is yielded for its items. A type that the bag does not define has no fields.
+    `kind`: the type. `prefix`: begins the paths. `fielddefs` of the bag has by type its constants and fields: a basic
+    type, a message, or a list.
     """
     from rosbags.interfaces import Nodetype
 
@@ -295,7 +299,11 @@ def format_moment(nanoseconds: int) -> str:
 
 
 def _check_fields_of_sources(path: Path, reader: "AnyReader", sources: TopicReader) -> None:
-    """Raise ValueError if a source maps a field that the message type of its topic does not have."""
+    """Raise ValueError if a source maps a field that the message type of its topic does not have.
+
+    A connection is a topic of the bag with its message type. `list_fields` yields (path, basic type) of the type's
+    fields; `_has_field` looks a source's path up among them.
+    """
     for connection in reader.connections:
         what = f"{path}, {connection.topic}"
         fields = dict(list_fields(reader, connection.msgtype))

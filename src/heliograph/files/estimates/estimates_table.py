@@ -86,7 +86,11 @@ def make_column_header(name: str, unit: str | None) -> str:
 
 
 def _find_angles(record: Record) -> Angles:
-    """Return the indices of the states that are angles; () if the record does not hold its network, as `run` has it."""
+    """Return the indices of the states that are angles, by the plant of the network that was run; () if it is unknown.
+
+    `record.origin` of what `run` returns holds the network as `model`; of a record that was read from a file it is
+    None. A plant that varies over time is taken at its first step (`first`).
+    """
     network = getattr(record.origin, "model", None)
     return first(network.plant).angles if isinstance(network, Network) else ()
 
@@ -136,7 +140,9 @@ def _make_predicted_columns(
 ) -> list[tuple[str, np.ndarray]]:
     """Return columns (header, values) of predictions of each row: means, and standard deviations if they are claimed.
 
-    Those of states are named as the states, those of sensors' outputs begin with "output.".
+    Those of states are named as the states, those of sensors' outputs begin with "output.". `make_column_header` puts
+    the unit behind a name. A prediction has names, means and deviations (rows, numbers), and a claim, "none" without
+    deviations.
     """
     # (beginning of the names, predicted quantities, {name: unit})
     parts = [("", predicted.states, record.units)]

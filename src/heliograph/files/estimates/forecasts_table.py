@@ -29,7 +29,8 @@ def make_forecast_columns(
     The column `forecast` is true in rows of forecasts. What each sensor would measure then stands in the columns
     forecast.OUTPUT and forecast.OUTPUT.sd (standard deviation), NaN in rows of data; the names begin with node and
     filter if there are several. `record`: a run over data. `forecasts`: by node and filter, after the last row of data.
-    `predicted`: optional one-step predictions of rows of data, NaN in rows of forecasts.
+    `predicted`: optional one-step predictions of rows of data, NaN in rows of forecasts. `_append_rows` puts the
+    forecast's rows below those of the data, NaN where it has none.
     """
     # All forecasts have the same times.
     times = next(forecast for filters in forecasts.values() for forecast in filters.values()).time

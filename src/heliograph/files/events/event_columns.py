@@ -79,7 +79,8 @@ class NodeEvents:
     def note_unread(self, unread: Unread, arrival: float | None) -> None:
         """Note a message that came but could not be read, so that its running count is not taken for a lost one.
 
-        Its moment is its time of measuring, else its arrival, else the newest event's time.
+        Its moment is its time of measuring, else its arrival, else the newest event's time. `unread.counted` is what
+        was read of it, None if not even that; `self.refused` counts by reason.
         """
         if isinstance(unread.error, RefusedError):
             self.refused[unread.error.reason] += 1
@@ -109,7 +110,8 @@ class NodeEvents:
     ) -> None:
         """Write into the last column of `table` how many messages were lost before each event, by the running counts.
 
-        Only NaN is replaced, where the message itself did not say the number.
+        Only NaN is replaced, where the message itself did not say the number. `self.sequence`: running counts of all
+        events of the node, -1 where messages have none; then nothing is written.
 
         Args:
             table: values by row, the last of them the number of losses.
@@ -166,7 +168,7 @@ class NodeEvents:
         A stamp (time of measuring) that is more than a year before its arrival was not set. If most are, stamps and
         arrivals are of two clocks: nothing is removed, and arrivals are replaced by the times of measuring. If no
         arrivals are known, a stamp was not set if it is more than a year away from both neighbours, which are near each
-        other.
+        other. `_note_unset` keeps their moments and counts, so that they do not count as lost.
         """
         time, arrival, _sequence = self.arrays()
         if not len(time):
@@ -194,6 +196,7 @@ class NodeEvents:
         """Note events whose stamps are not set (mask `unset`) in `self.unread`: the moments they came, their counts.
 
         If arrivals are not known, the moment is the time of the last earlier event with a stamp, or else of the first.
+        `self.arrays()` are times, arrivals and counts; without known arrivals each arrival is the event's own time.
         """
         time, moments, sequence = self.arrays()
         if not are_arrivals_known:
@@ -220,7 +223,10 @@ def count_missing_messages(time: np.ndarray, sequence: Int[np.ndarray, " events"
 
 
 def node_counts_losses(network: Network, name: str) -> bool:
-    """Return whether a node also receives a number on losses: how many transmissions were lost before its values."""
+    """Return whether a node also receives a number on losses: how many transmissions were lost before its values.
+
+    Such a sender has a trigger that numbers its transmissions.
+    """
     node = network.nodes[name]
     if not isinstance(node, Node) or node.trigger is None or node.trigger.losses != "numbered":
         return False

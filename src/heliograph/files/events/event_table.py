@@ -236,7 +236,7 @@ class EventTable:
 
     @property
     def dated(self) -> bool:
-        """Return whether times are dates."""
+        """Return whether times are dates, and neither numbers (`numbers`) nor steps without a length in seconds."""
         return not self._times_are_steps and not self.numbers
 
     @property
@@ -276,7 +276,7 @@ class EventTable:
             ValueError: the step is not positive.
         """
         laws, unit = {}, 1 if self.numbers else SECOND
-        for name, delays in self.lateness().items():
+        for name, delays in self.lateness().items():  # from measuring to arrival, in seconds or the unit of time
             length = self.step / SECOND if step is None and self.step is not None else step
             if length is None:  # take the median interval; numbers of steps are 1 apart
                 time, _arrival, _sequence = self.columns[name].arrays()
@@ -343,7 +343,7 @@ class EventTable:
         Raises:
             ValueError: what `recording` refuses.
         """
-        events, verdicts = self._judge_events(window, ahead)
+        events, verdicts = self._judge_events(window, ahead)  # what a timeline would do with each: USED, LATE, ...
         events = events.select(verdicts == USED)
         if not len(events.time):
             raise fail("events", "at least one that is used", "none")
@@ -351,8 +351,8 @@ class EventTable:
         events = events.select(np.lexsort((events.sequence, events.node, events.time)))
         if self.steps and events.time[-1] >= MOST_STEPS:  # each step is a row
             raise fail("time of an event", f"a step below {MOST_STEPS:,}", int(events.time[-1]))
-        row, times = number_rows(events.time, self.steps, self._are_rows_joint)
-        tables = self._fill_tables(events, row, len(times))
+        row, times = number_rows(events.time, self.steps, self._are_rows_joint)  # row of each event, time of each row
+        tables = self._fill_tables(events, row, len(times))  # by node, and of the inputs: (rows, values), NaN if none
         inputs = fill_forward(tables.pop(INPUTS))
         if not self.steps:
             inputs = make_inputs_leading_to_rows(inputs, times, self._unit, self.network.inputs.index(TIME_STEP))
@@ -376,7 +376,7 @@ class EventTable:
 
     @property
     def _are_rows_joint(self) -> bool:
-        """Return whether all events of one time are one row."""
+        """Return whether all events of one time are one row: if time counts steps, or all nodes have one channel."""
         return self.steps or self.network.common is not None
 
     def _list_value_matrices(self) -> list[np.ndarray]:

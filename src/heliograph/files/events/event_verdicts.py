@@ -43,6 +43,9 @@ def sort_by_arrival(columns: Mapping[str, NodeEvents]) -> EventsByArrival:
 
     Events without a running count get one: how many events of the same node and time arrived before.
 
+    `lexsort` sorts by the last key first: by arrival, then in the order in which a node's events came. `event_index`
+    numbers the events of one node.
+
     Args:
         columns: the events of the inputs, whose node number is -1, and then of each node, numbered from 0.
 
@@ -74,7 +77,8 @@ def judge_events(
     An event is a node's message, with time, arrival and running count; all events of a time, or one alone, make a row.
     It is in the future if its time is later than its arrival by more than `ahead`. It is late if its row was final
     before it came: at each arrival the rows older than that by more than the window become final. Of events of one
-    node, count and time the first is used; if rows are joint, so are the first values of a node at a time.
+    node, count and time the first is used; if rows are joint, so are the first values of a node at a time. USED, LATE,
+    FUTURE, DUPLICATE and CONFLICT are such indices.
 
     Args:
         events: the events, in order of arrival.
@@ -97,7 +101,8 @@ def judge_events(
     newest_final = _find_newest_final_row(some, row, window)
     is_late = row <= newest_final if joint else row < newest_final
     verdicts[candidates[is_late]] = LATE
-    # Rival events are of one node in one row. Most are alone there, and stay used.
+    # Rival events are of one node in one row, as copies are; they come in order of arrival, and the first one stays.
+    # Most are alone there, and stay used.
     row_and_node = _rank_rows(some.time, some.node) if joint else identity
     has_rivals: Bool[np.ndarray, " rows_and_nodes"] = np.bincount(row_and_node, minlength=1) > 1
     contenders = np.flatnonzero(has_rivals[row_and_node] & (row >= newest_final))
@@ -184,7 +189,8 @@ def _find_newest_final_row(
 ) -> Int[np.ndarray, " events"]:
     """Return for each event the rank of the newest row that is final when the event arrives, -1 if there is none.
 
-    A row of time t is final once some event arrives later than t + window. Rows are ranked by time.
+    A row of time t is final once some event arrives later than t + window. Rows are ranked by time. `watermark` is how
+    far time has certainly got at each arrival.
 
     Args:
         events: the events, in order of arrival.

@@ -30,6 +30,9 @@ def open_frame_log(path: Path, sources: LogSources, wanted: Wanted) -> Log:
 
     Without a database, messages are named by their identifiers and have no signals.
 
+    A `Log` has units, kinds and bits of the signals by message, the messages, and notes on what was left out, which are
+    complete once the messages are read. `wanted`: says of a message's name whether it is decoded.
+
     Raises:
         ValueError: the database cannot be read.
         ModuleNotFoundError: python-can or cantools is not installed (extra "can"), or asammdf (extra "mdf").
@@ -74,10 +77,10 @@ def read_can_database(path: Path) -> Database:
 def find_words(signal: "Signal") -> dict[float, str]:
     """Return {value: word} for values of a physical quantity that are no measurement, such as "SNA" (not available).
 
-    A value stands for a word if the database names it and it is out of the signal's range, or is at the end of what
-    its bits hold: from 0xFB.. of 0xFF.. on, or for a signed signal the least and the greatest. A named value within
-    the range, such as 0 "standstill", is a measurement. So are all values of a signal without unit, scale and offset,
-    which counts or enumerates.
+    A value stands for a word if the database names it and it is out of the signal's range, or is at the end of what its
+    bits hold: from 0xFB.. of 0xFF.. on, or for a signed signal the least and the greatest. A named value within the
+    range, such as 0 "standstill", is a measurement. So are all values of a signal without unit, scale and offset, which
+    counts or enumerates. CODES is 0xFB / 0xFF.
     """
     is_quantity = signal.unit or signal.scale != 1 or signal.offset != 0
     if not is_quantity or not signal.choices or signal.is_float:
@@ -126,6 +129,9 @@ class FrameReader:
     def read_messages(self) -> Iterator[FileMessage | InputError]:
         """Yield the messages in the order of the file, or why one cannot be read; then note what was left out.
 
+        `item` is a frame with its time, or the error that ends a damaged log. Error frames, remote frames and those of
+        another bus (`channel`) are left out and counted.
+
         Raises:
             ValueError: no frame of a wanted message, frames all of which are too short for it, or of two buses.
         """
@@ -163,6 +169,9 @@ class FrameReader:
     def _decode_frame(self, frame: "Message", moment: float, where: str) -> FileMessage | InputError | None:
         """Return the message in a frame, or the error that says why it cannot be read; None if it is not wanted.
 
+        `self._wanted` says whether a message of a name is decoded; without a database messages are named by their
+        identifiers. `_check_channel` refuses frames of one message from two buses.
+
         Args:
             frame: the frame.
             moment: its time in seconds since 1970.
@@ -186,8 +195,14 @@ class FrameReader:
     def _decode_signals(self, frame: "Message", description: "Description", where: str) -> dict[str, Any] | InputError:
         """Return {name of a signal: its value, or None if the frame has none}, or the error why it cannot be read.
 
-        A value that is a word, such as "not available", is None, too. Frames of other lengths than described, and such
-        words, are counted. `description`: the frame's message as the database has it. `where`: for errors.
+        The error is returned, not raised, since only this frame is refused and reading goes on. A value that stands for
+        a word, such as "not available", becomes None, too. Frames of other lengths than described, and such words, are
+        counted for notes to the user.
+
+        Args:
+            frame: the frame, as python-can reads it.
+            description: the frame's message as the database has it; `length` is its number of bytes.
+            where: place of the frame, for errors.
         """
         size, length = len(frame.data), description.length
         if size < length:
@@ -201,6 +216,7 @@ class FrameReader:
             self._longer[description.name] += 1
         # A multiplexed message has only some of its signals in each frame; the others are None.
         signals: dict[str, Any] = dict.fromkeys(signal.name for signal in description.signals) | decoded
+        # `self._words`: for each signal of a message {number: the word that it stands for}.
         for name, words in self._words[description.name].items():
             if words and (word := words.get(signals[name])) is not None:
                 self._came_as_words[f"{description.name}.{name} {word!r}"] += 1
@@ -219,7 +235,7 @@ class FrameReader:
         """Raise ValueError if all frames of a wanted message are too short, or if no frame is of a wanted message.
 
         By a message's name, `self._short` counts the sizes of frames too short to decode, and `self._decoded` counts
-        decoded frames.
+        decoded frames. `self._identifiers` counts the frames by identifier, for the error.
         """
         remedy = "another database, or another bus (channel=)?"
         for name, sizes in self._short.items():
@@ -236,7 +252,11 @@ class FrameReader:
 
 
 def _read_frames(path: Path, sources: LogSources) -> "Iterator[tuple[Message, float] | InputError]":
-    """Yield (frame, its time in seconds since 1970); if the file is damaged, the last item is a `CutOffError`."""
+    """Yield (frame, its time in seconds since 1970); if the file is damaged, the last item is a `CutOffError`.
+
+    `opened` has the reader, `begin` (the log's begin as the reader counts times) and `shift` (added to the reader's
+    times gives seconds since 1970). DIGITS: decimals of a time in seconds.
+    """
     count = 0
     with ExitStack() as stack:
         try:
@@ -301,7 +321,8 @@ def _open_frame_reader(path: Path, stack: ExitStack) -> _OpenedFrames:
 def _open_asc(path: Path, stack: ExitStack) -> _OpenedFrames:
     """Open an ASC log, whose frames have seconds since the log's begin; `stack` closes it.
 
-    The date of the begin has no time zone, and is read as UTC on every machine.
+    The date of the begin has no time zone, and is read as UTC on every machine. `_OpenedFrames` has the reader, the
+    log's begin in the reader's times, and what is to be added to these for seconds since 1970.
 
     Raises:
         ValueError: the times are differences between neighbouring events.

@@ -32,7 +32,8 @@ def open_logs(path: Path, sources: LogSources, wanted: Wanted) -> Log:
     logs = [open_log(part, sources, wanted) for part in list_logs(path) or [path]]
     if len(logs) == 1:
         return logs[0]
-    # A log's notes (lines on what was left out) are complete once all its messages have been read.
+    # One `Log` of all: units and bits of the signals and kinds of the messages, by message, then the messages
+    # themselves. A log's notes (lines on what was left out) are complete once all its messages have been read.
     notes = list[str]()
 
     def read_one_after_another() -> Iterator[FileMessage | InputError]:
@@ -52,7 +53,7 @@ def open_logs(path: Path, sources: LogSources, wanted: Wanted) -> Log:
 def _join_units(logs: Sequence[Log]) -> dict[str, dict[str, str]]:
     """Return {topic: {signal: its unit}} of the signals that any of the logs has.
 
-    Units of a signal that differ between logs stand side by side, as "m/s or km/h".
+    Units of a signal that differ between logs stand side by side, as "m/s or km/h". OR is " or ".
     """
     units = dict[str, dict[str, str]]()
     for log in logs:
@@ -68,7 +69,7 @@ def open_log(path: Path, sources: LogSources, wanted: Wanted) -> Log:
     """Open a vehicle's log; its format follows from its extension.
 
     ULog files, and MDF files without a database, hold decoded signals. All others hold frames of a CAN bus, raw bytes
-    from which a database of the bus's messages (DBC) decodes signals.
+    from which a database of the bus's messages (DBC) decodes signals. ULOG and MDF are the extensions of these formats.
 
     Args:
         path: the log.
@@ -126,6 +127,8 @@ def _find_signal_units(where: str, path: Path, log: Log, sources: TopicReader) -
 
     A log holds messages, each with signals. A source says which signal of which message is a measurement; a topic is
     the name of a message. A topic of the sources with a wildcard (+ or #) need not be in the log.
+
+    STAMP is the field "timestamp", OR the text " or " between units that differ from log to log.
 
     Args:
         where: what is read, to begin the text of errors.

@@ -49,7 +49,8 @@ def open_mdf(path: Path, sources: LogSources, wanted: Wanted) -> Log:
         raise
     except Exception as error:  # whatever a damaged file makes a reader do
         raise fail(str(path), "an MDF4 file", error_text(error)) from None
-    return Log(units, dict.fromkeys(names, "MDF4"), merge_series(path, begin, series), [])
+    messages = merge_series(path, begin, series)  # of all groups, in order of time
+    return Log(units, kinds=dict.fromkeys(names, "MDF4"), messages=messages, notes=[])
 
 
 def _name_groups(file: "MDF") -> list[str]:
@@ -80,7 +81,8 @@ def _read_group(file: "MDF", group: int, indices: dict[str, int]) -> MessageSeri
     """Return the samples of a group: times in seconds from the file's start, and the values of each signal.
 
     `indices` maps the name of a signal to its index in the group. A sample that the file marks as invalid becomes None.
-    A signal with several numbers per sample is left out.
+    A signal with several numbers per sample is left out. A `MessageSeries` is times and {signal: values}, (samples,)
+    each.
     """
     time, values = np.zeros(0), dict[str, np.ndarray]()
     for name, index in indices.items():

@@ -40,8 +40,8 @@ def open_ulog(path: Path, sources: LogSources, wanted: Wanted) -> Log:
     except Exception as error:  # whatever a damaged file makes a reader do
         raise fail(str(path), "a ULog file", error_text(error)) from None
     topics = {data.name if data.multi_id == 0 else f"{data.name}.{data.multi_id}": data for data in file.data_list}
-    # Units of the fields by topic, all "" since a ULog file does not have them; of wanted topics also the values of the
-    # fields over time.
+    # STAMP is the field with the microseconds since the start. Units of the fields by topic, all "" since a ULog file
+    # does not have them; of wanted topics also the values of the fields over time.
     units = {name: dict.fromkeys((field for field in data.data if field != STAMP), "") for name, data in topics.items()}
     series = {
         name: MessageSeries(data.data[STAMP] * MICROSECOND, {field: data.data[field] for field in units[name]})
@@ -58,7 +58,8 @@ def open_ulog(path: Path, sources: LogSources, wanted: Wanted) -> Log:
         notes.append(f"{path}: the device lost {len(file.dropouts)} times what it should have logged")
     if file.file_corruption:
         notes.append(f"{path}: damaged; what could be read is used")
-    return Log(units, dict.fromkeys(topics, "ULog"), merge_series(path, begin, series), notes)
+    messages = merge_series(path, begin, series)  # of all topics, in order of time
+    return Log(units, kinds=dict.fromkeys(topics, "ULog"), messages=messages, notes=notes)
 
 
 def _find_start_date(file: "ULog") -> float:

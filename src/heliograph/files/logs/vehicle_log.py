@@ -60,6 +60,8 @@ def list_logs(path: Path) -> list[Path]:
 def merge_series(path: Path, begin: float, series: Mapping[str, MessageSeries]) -> Iterator[FileMessage]:
     """Yield the messages of several series in order of time; each gets its time as the field STAMP.
 
+    A `FileMessage` has place, topic, content and time of arrival.
+
     Args:
         path: the log, for the places of messages in errors.
         begin: moment from which the times of the series count, in seconds since 1970.

@@ -20,6 +20,8 @@ def is_message_folder(path: Path) -> bool:
 def list_message_files(folder: Path) -> list[Path]:
     """Return the message files directly in a folder, sorted by name: tables and files of lines.
 
+    LINES: extensions of files with a message a line, such as .jsonl.
+
     Raises:
         ValueError: there is no such file.
     """

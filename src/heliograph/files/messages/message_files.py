@@ -88,7 +88,7 @@ def read_message_file(path: Path) -> Iterator[FileMessage | InputError]:
 def parse_log_line(text: str) -> tuple[str, str, str | None] | None:
     """Return (topic, payload, arrival) of a line that an MQTT client printed; None for any other line.
 
-    The arrival, a date or seconds, is None if the line has none.
+    The arrival, a date or seconds, is None if the line has none. LOGGED is the pattern of such a line.
     """
     match = LOGGED.fullmatch(text.strip())
     return None if match is None else (match["topic"], match["payload"], match["arrival"])
@@ -97,7 +97,8 @@ def parse_log_line(text: str) -> tuple[str, str, str | None] | None:
 def read_log_entry(content: object) -> tuple[str, Any, Any, bool] | None:
     """Return (topic, payload, arrival, was_stored) of a message that a log holds in JSON, or None for other content.
 
-    `was_stored`: the broker had stored the message (MQTT's flag "retain").
+    `was_stored`: the broker had stored the message (MQTT's flag "retain"). TOPIC and PAYLOAD are the fields `topic` and
+    `payload`.
     """
     if not isinstance(content, dict) or not isinstance(content.get(TOPIC), str) or PAYLOAD not in content:
         return None
@@ -160,6 +161,9 @@ def _read_json_messages(path: Path) -> Iterator[FileMessage | InputError]:
 def parse_message_document(text: str | bytes, name: str) -> list[FileMessage | InputError]:
     """Return the messages of a JSON document, which may be nested lists; an error stands in place of a bad message.
 
+    `decode_items` yields each item of the document with the name of a field that occurs twice in it, or None: such an
+    item is an error.
+
     Raises:
         ValueError: the text is not JSON.
     """
@@ -173,7 +177,7 @@ def parse_message_line(where: str, line: str) -> list[FileMessage | InputError]:
     """Return the messages of a line, or the reason why it cannot be read.
 
     The line is JSON: a message or a list of messages. Otherwise it may be a topic and a payload, as MQTT clients print
-    them.
+    them. `parse_log_line` returns topic, payload and time of such a line, None if it is none.
     """
     line = line.strip()
     if not is_valid_text(line):
@@ -208,7 +212,8 @@ def _read_csv_messages(path: Path) -> Iterator[FileMessage | InputError]:
 def convert_cells(row: CsvRow) -> dict[str, Any]:
     """Return {name: value} for the cells of a row: numbers, flags (true, False), None for empty cells, and texts.
 
-    Integers keep every digit. A payload stays a text.
+    Integers keep every digit. A payload stays a text. FLAGS are the words true and false; `parse_number` returns a text
+    that is no number as it is.
     """
     results: dict[str, Any] = {}
     for name, cell in zip(row.header, row.cells, strict=True):

@@ -78,10 +78,11 @@ def read_messages(
 
     Args:
         path: the bag, the file or the folder, or the URL of a store.
-        network: the network.
-        sources: sources by topic, as `json_field` makes them; None for messages in our own form.
+        network: the network, which names the nodes and the numbers that each receives.
+        sources: sources by topic, as `json_field` makes them: which field of a message is which number of which node;
+            for a vehicle's log the `LogSources`. None for messages in our own form.
         progress: called with the numbers of messages read and to be read (default none).
-        strict: whether the first message that cannot be read is an error (default False).
+        strict: whether the first message that cannot be read is an error (default False: it is refused alone).
         ignore_unknown: whether columns that the network does not know are left out, of messages in our own form
             (default False: they are refused, since they may be misspelt).
 
@@ -103,6 +104,9 @@ def read_events(
     ignore_unknown: bool,
 ) -> EventTable:
     """Return the events of a bag, a log, a file or a folder, or of a store's table; an event is one node's values.
+
+    `TopicReader` checks sources against the network. Each `_read_...` function makes an `EventTable`, which also counts
+    what was refused; `finish` leaves out stamps that were never set.
 
     Args:
         source: path of the recording, or the table of a store.
@@ -141,7 +145,11 @@ def read_events(
 
 
 def _read_bags(path: Path, sources: TopicReader, progress: Progress | None, strict: bool) -> EventTable:
-    """Return the events of a bag, or of the bags in a folder, with messages of ROS, in JSON or in Protocol Buffers."""
+    """Return the events of a bag, or of the bags in a folder, with messages of ROS, in JSON or in Protocol Buffers.
+
+    `holds_messages` says that a file is MCAP with JSON or Protocol Buffers, which is read by its own reader; all others
+    are bags of ROS.
+    """
     events = EventTable(sources.network, sources.step_seconds)
     for bag in parts_of(path) or [path]:
         if holds_messages(bag):
@@ -186,7 +194,10 @@ def _yield_messages(
 def _read_table_of_own_format(
     path: Path | StoreTable, network: Network, strict: bool, ignore_unknown: bool
 ) -> EventTable:
-    """Return the events of a table in our own form, with the columns node, sequence, time and values."""
+    """Return the events of a table in our own form, with the columns node, sequence, time and values.
+
+    `ignore_unknown`: whether unknown columns are left out. `strict`: whether a row that cannot be read is an error.
+    """
     collector = OwnMessageCollector(network, path, table=True, ignore_unknown=ignore_unknown)
     for message in _yield_messages(path):
         collector.add(message, strict)
@@ -240,7 +251,8 @@ def _read_log(path: Path, table: object, sources: TopicReader, strict: bool) -> 
     """Return the events of a vehicle's log.
 
     `table`: the sources as the user gave them, with what decodes the log (`LogSources`). `sources`: the same, checked
-    against the network.
+    against the network. `strict`: whether a message that cannot be read is an error. `events.notes` gets lines on what
+    was left out.
     """
     events = EventTable(sources.network, sources.step_seconds)
     _append_messages_by_topic(path, read_log(path, table, sources, events.notes), sources, events, strict)
@@ -253,6 +265,7 @@ def _append_messages_by_topic(
     """Append the events of messages that name their topics, and return these topics.
 
     An unreadable message is counted (raised if `strict`). A `CutOffError` says where the file is damaged.
+    `events.broken` holds it as a text.
     """
     topics = set[str | None]()
     for message in messages:
@@ -347,6 +360,9 @@ def _append_reading(
 
 def _note_left_out(path: Path | StoreTable, sources: TopicReader, events: EventTable) -> None:
     """Add notes to the events on messages and files that were left out, and on clocks and senders of the sources.
+
+    `sources.clocks` has compared the clocks of topics, `sources.senders` the fields that name senders.
+    `sources.unknown` counts messages of topics without a source, `sources.stored` those that a broker had stored.
 
     Raises:
         ValueError: a field that no message of its topic had, clocks that cannot be joined.

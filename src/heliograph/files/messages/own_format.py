@@ -132,6 +132,8 @@ class OwnMessageCollector:
     def _check_local_time(self, table: EventTable) -> None:
         """Note where a node's dates, which have no zone, jump forward by an hour, as local time does in spring.
 
+        `columns` has the events of one node of one plant, in the order in which they came.
+
         Raises:
             ValueError: a node's dates go back by an hour, as in autumn: sorted by time, messages of two hours would be
                 mixed.
@@ -151,7 +153,8 @@ class OwnMessageCollector:
     def _add_message(self, message: FileMessage) -> None:
         """Add the event of one message to the table, and an event of the inputs if the message holds inputs.
 
-        Of a message whose values cannot be read the running count is noted, and the error is raised.
+        Of a message whose values cannot be read the running count is noted, and the error is raised. The reader returns
+        a list of (event or `Unread`, arrival).
         """
         readings_and_arrivals = self._reader.read(message.where, message.content)
         if self._table is None:
@@ -188,7 +191,10 @@ class HeliographMessageReader:
     def __init__(self, network: Network, source: str, ignore_unknown: bool, table: bool):
         """Prepare to read messages in heliograph's own format; nothing is known yet of their times and columns.
 
-        The class describes the arguments, and the attributes on times: `numbers`, `zero`, `rounded`, `least`, `most`.
+        `source` is named in errors. `ignore_unknown`: whether columns that the network does not know are left out.
+        `table`: whether messages are rows of a table. Of the times, `numbers` says whether they are numbers and not
+        dates, `zero` is the integer from which they are counted, `rounded` the first one that is no exact double then,
+        `least` and `most` are the ends of their range.
         """
         self.network, self.source = network, source
         self._ignore, self._table = ignore_unknown, table
@@ -212,6 +218,8 @@ class HeliographMessageReader:
         A message in our own form has a node, a count, a time and values; the time of arrival, the plant and inputs that
         were set may be in it too. An event is a `Reading` of a node's values, or of inputs. Where the values cannot be
         read, one `Unread` with node, count and time stands for the events, so that the message does not count as lost.
+        Names in capitals are the fields: NODE is "node", INPUTS "inputs", and so on; an event of inputs has INPUTS as
+        its node. NOTHING is an empty array.
 
         Args:
             where: place of the message, for errors.
@@ -252,7 +260,8 @@ class HeliographMessageReader:
     def _check_columns(self, where: str, row: Mapping[str, Any]) -> None:
         """Raise ValueError if a column is unknown, and so most likely misspelt, or if a required one is missing.
 
-        Rows with the same columns as the row before are not checked again.
+        Rows with the same columns as the row before are not checked again. OWN are the fields of our own form, such as
+        `node` (NODE), `sequence` and `time`; the others are named as components.
         """
         if row.keys() == self._columns:
             return
@@ -272,7 +281,9 @@ class HeliographMessageReader:
     def _read_time(self, cell: Any, where: str, column: str) -> tuple[Any, bool]:
         """Return a time and whether it is a date; raise ValueError unless all times are of one kind.
 
-        A date is returned in nanoseconds since 1970, another time as a number.
+        A date is returned in nanoseconds since 1970, another time as a number. `self.numbers` says whether the times so
+        far were numbers, `self._zoned` whether dates had a zone; None before the first. `self.steps`: the network
+        counts steps.
         """
         name = f"{where}, column {column!r}"
         dated = isinstance(cell, str) and looks_like_date(cell)
@@ -292,8 +303,9 @@ class HeliographMessageReader:
     def _read_number_of_time(self, cell: Any, name: str, is_step: bool) -> float:
         """Return a time that is a number; a step (`is_step`) must be an integer from 0 on.
 
-        If the first integer is too large for a double (EXACT, 2^53), such as nanoseconds, all times are counted from
-        it (`self.zero`). `self.rounded` is the first time whose difference from it is no exact double.
+        If the first integer is too large for a double (EXACT, 2^53), such as nanoseconds, all times are counted from it
+        (`self.zero`). `self.rounded` is the first time whose difference from it is no exact double. `cell`: the time as
+        it came. `name`: its place, for errors.
         """
         number = _parse_number(cell, name)
         if isinstance(cell, int):

@@ -96,7 +96,8 @@ def read_recording_rows(
     """Read a recording as `read_recording` does; unless `strict`, a row that cannot be read is refused alone.
 
     If the network counts steps, a refused row is a step in which nothing arrived and inputs did not change. Unless
-    `strict`, rows of continuous time are sorted by their times.
+    `strict`, rows of continuous time are sorted by their times. `RowReader` makes a recording of rows and collects what
+    it refuses.
 
     Returns:
         The recording, the reasons why rows were refused, and lines on rows that were sorted.
@@ -139,8 +140,9 @@ def write_recording(recording: Recording, network: Network, path: str | Path) ->
 def _map_headers(network: Network) -> dict[str, str]:
     """Return {header that a column may have: name of the column}.
 
-    A header is the column's name with or without the unit of its state, input or output, as in "range (m)". It may
-    also be in the form in which `write_table` writes names that no cell can hold.
+    A header is the column's name with or without the unit of its state, input or output, as in "range (m)". It may also
+    be in the form in which `write_table` writes names that no cell can hold. `append_unit` puts the unit behind a name
+    that has one.
     """
     received = {node: receiver.received_names for node, receiver in network.nodes.items()}
     names = [*network.states, *network.inputs, *(name for components in received.values() for name in components)]
@@ -191,6 +193,9 @@ class RowReader:
     def read(self, rows: TableRows) -> Recording:
         """Return the rows that can be read.
 
+        `read_cells` checks each row and leaves out those that cannot be read; `arrange_recording` puts the others in
+        order and fills what is missing.
+
         Raises:
             ValueError: unknown, missing or doubled columns; times that go backwards; a row that cannot be read, where
                 reading is strict. One line that names the row, from 1, and the column.
@@ -209,6 +214,8 @@ class RowReader:
         """Return rows sorted by their times, or as they are if reading is strict.
 
         `self._behind` counts rows that came after later ones. `self.refused` gets the reasons why rows were left out.
+        `cells`: the rows that could be read. `order_rows` returns them sorted, the errors of those left out, and how
+        many came late.
 
         Raises:
             ValueError: a clock of local time was set back by an hour: put in order, rows of two hours would be mixed.
@@ -231,7 +238,8 @@ class RowReader:
         """Return rows in the order of their times as a recording; refused rows become steps, if every row is a step.
 
         Args:
-            cells: the rows.
+            cells: the rows that could be read: their numbers in the table, times, and columns of measurements, inputs
+                and true states.
             before: the last row of the block before, None for the first block. Missing times and inputs of these rows
                 are filled from it.
 
@@ -243,7 +251,8 @@ class RowReader:
         if before is not None:
             begin, first_number = 1, int(before.numbers[0])
             cells = join_recording_rows([before, cells])
-        # Rows that were refused get a time between their neighbours and NaN as measurements.
+        # Rows that were refused get a time between their neighbours and NaN as measurements: `fill` sets a column's
+        # values into the rows that were read, and NaN into the others.
         rows = insert_missing_rows(cells.numbers, self.network, first_number)
         time = rows.fill_times(cells.time)
         u = _make_inputs(self.network, cells.inputs, time, rows, self.source)
@@ -259,7 +268,8 @@ class RowReader:
         """Return the times, inputs, measurements and truth of the rows that can be read; each row is checked by itself.
 
         `self._headers` maps a header that a column may have to the column's name. `refusals.good` is the mask of the
-        rows that were not refused.
+        rows that were not refused. `refusals` collects the errors of refused rows, or raises the first one where
+        reading is strict.
 
         Raises:
             ValueError: the same as of `read`, but not for times that go backwards.

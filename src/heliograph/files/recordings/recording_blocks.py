@@ -91,7 +91,8 @@ class RecordingBlocks:
         """Yield parts of a table as recordings, each of which goes on from the last row of the one before it.
 
         Each part is sorted by itself, and `BlockOrderCheck` makes sure that all rows are sorted then. Rows that the
-        reader refused, and warnings on a part (`doubts`), are collected over all parts.
+        reader refused, and warnings on a part (`doubts`), are collected over all parts. `order.last` is the last row of
+        the part before, from which missing times and inputs are filled; `put_in_order` sorts a part by time.
         """
         order = BlockOrderCheck(self._path, self._reader.network)
         for unordered in self._yield_cells(parts):

@@ -74,6 +74,7 @@ def read_cells(columns: Mapping[str, np.ndarray], network: Network, refusals: Ro
     if TIME in inputs:
         raise fail("input names", f"none called {TIME!r}, which is the recording's own column", list(inputs))
     truth_columns = list_truth_columns(network)
+    # For each quantity the names that its column may have, the preferred one first; any other column is refused.
     expected = [
         (TIME,),
         *((name,) for name in inputs),
@@ -81,12 +82,13 @@ def read_cells(columns: Mapping[str, np.ndarray], network: Network, refusals: Ro
         *((name,) for name in truth_columns.values()),
     ]
     _refuse_unknown_columns(columns, expected, source)
+    # Read column by column: `_find_column` returns which of the names a column has, or raises.
     time = _read_times(columns, _find_column(columns, (TIME,), source), refusals)
     measurements = {}
     for node, components in received.items():
         found = [_find_column(columns, names, source) for names in components]
         measurements[node] = np.stack([_read_measurements(columns, column, refusals) for column in found], axis=1)
-    # All inputs have to be there, except a time step dt, which follows from the times.
+    # All inputs have to be there, except a time step dt (TIME_STEP), which follows from the times.
     given = {
         name: _read_column_without_gaps(columns, _find_column(columns, (name,), source), refusals)
         for name in inputs
@@ -108,7 +110,10 @@ def list_truth_columns(network: Network) -> dict[str, str]:
 
 
 def list_received_columns(network: Network) -> dict[str, list[tuple[str, ...]]]:
-    """Return for each node, and each component that it receives, the allowed column names, the preferred one first."""
+    """Return for each node, and each component that it receives, the allowed column names, the preferred one first.
+
+    `received_names` are the names of what a node receives.
+    """
     names = {node: receiver.received_names for node, receiver in network.nodes.items()}
     # How many things each name may be meant for: one alone may be called by it without its node.
     uses = Counter([TIME, *network.inputs])
@@ -132,6 +137,7 @@ def _refuse_unknown_columns(columns: Mapping[str, np.ndarray], expected: list[tu
     """Raise a one-line ValueError with the closest known name if a column is not known to the network.
 
     `expected` holds for each state, input or component the names that its column may have, the preferred one first.
+    `columns`: the table's. `source`: its name, for errors.
     """
     known = [name for names in expected for name in names]
     for column in columns:
@@ -143,7 +149,10 @@ def _refuse_unknown_columns(columns: Mapping[str, np.ndarray], expected: list[tu
 
 
 def _find_column(columns: Mapping[str, np.ndarray], names: tuple[str, ...], source: str) -> str:
-    """Return which of these names, all for the same quantity, a column has; raise if no column or several have one."""
+    """Return which of these names, all for the same quantity, a column has; raise if no column or several have one.
+
+    `source`: name of the table, for errors.
+    """
     present = [name for name in names if name in columns]
     if len(present) != 1:
         came = f"both {' and '.join(map(repr, present))}" if present else f"only {', '.join(columns)}"
@@ -152,7 +161,10 @@ def _find_column(columns: Mapping[str, np.ndarray], names: tuple[str, ...], sour
 
 
 def _read_times(columns: Mapping[str, np.ndarray], name: str, refusals: RowRefusals) -> np.ndarray:
-    """Return the times of the rows, as numbers or as dates; rows without a time are refused."""
+    """Return the times of the rows, as numbers or as dates; rows without a time are refused.
+
+    `refusals` notes an error for each such row, or raises the first one where reading is strict.
+    """
     values = np.asarray(columns[name])
     if values.dtype.kind != "M":
         return _read_column_without_gaps(columns, name, refusals)
@@ -163,7 +175,9 @@ def _read_times(columns: Mapping[str, np.ndarray], name: str, refusals: RowRefus
 def _read_column_without_gaps(columns: Mapping[str, np.ndarray], name: str, refusals: RowRefusals) -> np.ndarray:
     """Return the numbers of a column that may have no gaps; rows without a finite number are refused.
 
-    Integers stay integers, since they may be too large for an exact double.
+    Integers stay integers, since they may be too large for an exact double; a missing one stands as the constant
+    MISSING, which `find_missing` knows. `refuse` notes an error for each of these rows, which names the cell as
+    `_describe_cell` shows it, or raises the first one where reading is strict.
     """
     values = columns[name] if columns[name].dtype.kind == "i" else _read_numbers(columns, name, refusals.source)
     refusals.refuse(find_missing(values) | ~np.isfinite(values), name, "a finite number", _describe_cell(values))

@@ -49,7 +49,8 @@ def order_rows(cells: RecordingRows, network: Network, source: str) -> tuple[Rec
     If time is continuous, a time that is more than a year outside of all others was not set: its row is refused, and
     the other rows are put in the order of their times. If each row is a step, as few rows as possible are refused so
     that times do not go backwards. All rows stay as they are if half of them or more would be refused, or if there is a
-    column `dt`, whose numbers belong to the order of the rows.
+    column `dt`, whose numbers belong to the order of the rows. MOST_OUT is this half, and TIME_STEP the column `dt`,
+    which networks in continuous time have as an input.
 
     Args:
         cells: the rows of a table: times, numbers of the rows, measurements and inputs.
@@ -66,7 +67,7 @@ def order_rows(cells: RecordingRows, network: Network, source: str) -> tuple[Rec
         is_refused = find_unset_stamps(stamps, YEAR if dated else YEAR / SECOND)
         expected = "a time that was set, near the others"
     else:
-        is_refused = find_out_of_order(stamps)
+        is_refused = find_out_of_order(stamps)  # as few as possible, so that the others do not go backwards
         expected = "a time that does not go backwards"
     if TIME_STEP in cells.inputs or np.mean(is_refused) >= MOST_OUT:
         return cells, [], 0
@@ -126,7 +127,8 @@ def lacks_second_row(cells: RecordingRows, network: Network, source: str) -> boo
     """Return whether `cells`, the first readable rows of a table, are too few to date the unreadable rows before them.
 
     If every row is a step (there is no input dt), the times of those rows are extrapolated from the first two readable
-    ones (`RowsWithMissing.fill_times`), so that a single one does not suffice.
+    ones (`RowsWithMissing.fill_times`), so that a single one does not suffice. `order_rows` returns the rows sorted,
+    those without a time that can be right left out.
     """
     if TIME_STEP in network.inputs or not len(cells.numbers):
         return False
@@ -138,7 +140,8 @@ def insert_missing_rows(numbers: np.ndarray, network: Network, first: int = 1) -
     """Return the rows with these numbers, and, if every row is a step, also the missing rows between them.
 
     Without an input dt every row is a step, and steps begin with row number `first`. The result holds for each row its
-    number, the index of the last row that was read up to it, and whether the row itself was read.
+    number, the index of the last row that was read up to it, and whether the row itself was read. `network.inputs`:
+    names of the inputs.
     """
     if TIME_STEP in network.inputs or not len(numbers):
         return RowsWithMissing(numbers, np.arange(len(numbers)), np.ones(len(numbers), dtype=bool))

@@ -88,7 +88,8 @@ class BlockOrderCheck:
     def check_left_out_rows(self) -> None:
         """Check that all rows that blocks left out are more than a year before or after all kept rows.
 
-        Only all rows together decide whether a row must be left out, so a single block may have been wrong.
+        Only all rows together decide whether a row must be left out, so a single block may have been wrong. `_first`
+        and `last` are the first and the last row that was kept. The error makes the caller read the file as a whole.
 
         Raises:
             RowsNotInBlocksError: a row that was left out is within a year of the kept rows.

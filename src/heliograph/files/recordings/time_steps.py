@@ -15,8 +15,10 @@ def compare_steps_with_times(dt: np.ndarray, time: np.ndarray, numbers: np.ndarr
 
     A warning is given where the steps of the other rows are not the differences of their times, which tells nothing of
     those that were refused; and of a row that says a step quite other than the time that has passed. `numbers` are
-    those of the rows in the table.
+    those of the rows in the table. `dt`, `time`: the column dt and the times of all rows (rows,). `source`: name of the
+    table, for warnings.
     """
+    # SAME_STEP: a relative difference of 1e-3, as of rounded times.
     is_behind_refused = np.diff(numbers, prepend=numbers[:1]) > 1
     since_row_before = seconds_between(time)
     others = np.flatnonzero(~is_behind_refused)[1:]  # the first row's step is not in the table's times

@@ -27,7 +27,8 @@ class _UplinkLayout(NamedTuple):
         """Return {the server's topic: the source of its uplinks}.
 
         LoRaWAN devices send uplinks to a network server, which publishes each as a JSON message. A source says which
-        fields are which values of a node; `radio` adds how the message was received.
+        fields are which values of a node; `radio` adds how the message was received. RADIO are the two names;
+        COUNT_BITS, 16, are the bits of the frame counter.
 
         Args:
             path: dotted path within the decoded payload, or several.

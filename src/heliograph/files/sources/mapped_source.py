@@ -62,7 +62,8 @@ def _check_wildcards(topic: str, source: Source) -> None:
 def _check_time_unit(topic: str, source: Source, time_counts_steps: bool) -> None:
     """Raise ValueError if a source's times are steps and the network's are not, or the other way round.
 
-    Times are steps if the source counts steps, or if it says how many seconds a step has.
+    Times are steps if the source counts steps, or if it says how many seconds a step has. `time_counts_steps`: whether
+    the network counts steps.
     """
     are_steps = source.step is not None or (source.time is not None and source.time_unit == "step")
     if time_counts_steps == are_steps:
@@ -80,6 +81,8 @@ def _check_time_unit(topic: str, source: Source, time_counts_steps: bool) -> Non
 
 def _find_output_indices(topic: str, source: Source, names: NamesByNode) -> dict[str, np.ndarray]:
     """Return {node: index among its numbers of each value of a source, (values,)}.
+
+    `names`: {node: names of its numbers}, "inputs" among the nodes.
 
     Raises:
         ValueError: an unknown node or output; one line that names the topic.
@@ -107,7 +110,10 @@ def _has_outputs(outputs: tuple[str, ...], source: Source) -> bool:
 
 
 def _index_outputs(topic: str, source: Source, known: tuple[str, ...]) -> np.ndarray:
-    """Return the index among the `known` outputs of a node for each path of a source."""
+    """Return the index among the `known` outputs of a node for each path of a source.
+
+    A source names the outputs of its paths, or has a path for each output of the node, in their order.
+    """
     outputs = source.outputs or known
     if len(outputs) != len(source.paths):
         expected = f"{len(known)} paths, for {', '.join(known)}, or output="

@@ -89,7 +89,8 @@ def _decode_json(text: str | bytes, name: str) -> tuple[Any, list[_DoubledField]
     """Return the content of JSON, and each object in it that has a field twice, with the field's name.
 
     Decoders keep the last of two fields of one name without a word, so the caller refuses such an object. `name`: of
-    the text, for errors. Words such as nan or inf, which are no JSON, are read as null.
+    the text, for errors. Words such as nan or inf, which are no JSON, are read as null. NO_NUMBERS is a pattern of such
+    words, and of quoted texts, which stay.
     """
     doubled = list[_DoubledField]()
 
@@ -162,7 +163,8 @@ def field_at(message: object, path: str, where: str) -> Any:
     Raises:
         ValueError: no such field; one line with the path and the fields that are there.
     """
-    # A message of a bag is an object with attributes, and there are millions: all of the path at once, if it has them.
+    # A message of a bag is an object with attributes (not of a PLAIN type, as JSON has), and there are millions: read
+    # all of the path at once, if it has them.
     if path and not isinstance(message, PLAIN):
         with suppress(AttributeError):
             return _make_attribute_getter(path)(message)
@@ -213,7 +215,8 @@ def parse_number(text: str) -> int | float | str:
     """Return the number that a text holds, or the text itself if it is not a number.
 
     Integers keep every digit, and a number of many digits is a `LongDecimal`. An integer that ends in .0 becomes a
-    double, unless this would lose digits.
+    double, unless this would lose digits. DIGITS: the most digits of an integer that is read so; EXACT is 2^53, from
+    where doubles skip integers.
     """
     digits = text.strip()
     if "_" in digits:  # only Python accepts such numbers
@@ -327,7 +330,10 @@ def parse_start(name: str, start: object) -> int:
 
 
 def convert_count(value: Any, name: str, quoted: bool = False) -> int:
-    """Return a running count as an integer; columns of numbers hold it as a float, and if `quoted` it may be a text."""
+    """Return a running count as an integer; columns of numbers hold it as a float, and if `quoted` it may be a text.
+
+    `name`: place of the value, for errors. Numbers of more than 63 bits are refused.
+    """
     if quoted and isinstance(value, str):
         value = parse_number(value)
     value = value.decimal if isinstance(value, LongDecimal) else value

@@ -29,7 +29,7 @@ class SenderCounter:
 
         Only fields that may name a sender are counted. If such a field has several values, senders are mixed. If it has
         more than MANY values, it names messages instead. Fields that a source has `asked` for are left out: they tell
-        senders apart already, or they are values.
+        senders apart already, or they are values. `topic`: of the message.
         """
         self._noted += 1
         if not isinstance(message, Mapping):

@@ -238,17 +238,18 @@ def json_field(
 
         sources = {"zigbee2mqtt/garden": hg.files.json_field("temp", node="garden", output="temperature")}
 
-    The same object reads JSON from MQTT, NATS, a pipe or a file, messages of a bag, and rows of a table, whose columns
-    are the fields. A path is dotted, with positions in lists as numbers ("pose.pose.position.x", "ranges.3"); a field
-    of that very name, dots included, comes first; "" is the message itself. A topic may have the wildcards of MQTT,
-    where `plant` or `node` says which sensor a message is of.
+    The result only describes what to read: JSON from MQTT, NATS, a pipe or a file, messages of a bag, or rows of a
+    table, whose columns are the fields. A topic may have the wildcards of MQTT, where `plant` or `node` says which
+    sensor a message is of. A path is dotted, with positions in lists as numbers ("pose.pose.position.x", "ranges.3"); a
+    field of that very name, dots included, comes first; "" is the message itself.
 
-    A value becomes `scale` value + `offset`; true is 1, false 0; null and numbers that are not finite did not arrive. A
-    time is a date of ISO 8601 with its zone, a stamp of ROS, or a number since 1970, or since the `start` of its
-    `Stamp`, in `time_unit`; with the unit
-    "step" it is a step of a network that counts steps. Without `time` a measurement is of the moment of its arrival.
-    With `step` the moments are counted in steps of so many seconds: each is of the nearest step, the first of step 0.
-    A count that is absent is 0, as JSON of protobuf has it; a message that has its count and no value measured nothing.
+    A value becomes `scale` value + `offset`; true is 1, false 0; null and numbers that are not finite did not arrive.
+
+    A time is a date of ISO 8601 with its zone, a stamp of ROS, or a number in `time_unit` since 1970, or since the
+    `start` of its `Stamp`; in the unit "step" it is a step of a network that counts steps. Without `time` a measurement
+    is of the moment of its arrival. With `step`, times are counted in steps of so many seconds: each is of the nearest
+    step, the first of step 0. A count that is absent is 0, as JSON of protobuf has it; a message that has its count and
+    no value measured nothing.
 
     Args:
         path: dotted path of the value, or the `Yaw` of a quaternion or a coordinate of a `Geodetic` position, or
@@ -344,7 +345,8 @@ def _parse_name_option(name: str, value: object) -> Any:
 def _split_conditions(where: object) -> tuple[Allowed, tuple[Available, ...]]:
     """Return the allowed values by path of a field, and the conditions on what devices say of themselves.
 
-    `where`: as `json_field` takes it: one condition, or several in a list, or None.
+    `where`: one condition or several in a list, or None: {path: allowed value or values}, or `Available` (a device's
+    word).
     """
     conditions = list(where) if isinstance(where, list | tuple) else [] if where is None else [where]
     available = tuple(condition for condition in conditions if isinstance(condition, Available))

@@ -71,6 +71,8 @@ class TopicClocks:
     def find_topics_without_dates(self, where: str) -> list[str]:
         """Return the topics whose clocks count from their own starts; raise ValueError if others have dates.
 
+        Times of both kinds cannot be put in one order; the error says how to give the date of a clock's start.
+
         Raises:
             ValueError: some topics count from their own start, and others have dates.
         """
@@ -86,7 +88,10 @@ class TopicClocks:
 
 
 def _find_time_field(topic: str, content: object, sources: Iterable[Source]) -> tuple[str, object]:
-    """Return the path and value of the sources' first time field that the message has, or ("", None)."""
+    """Return the path and value of the sources' first time field that the message has, or ("", None).
+
+    `content`: the message, decoded.
+    """
     for source in sources:
         if source.time is not None:
             with suppress(InputError):

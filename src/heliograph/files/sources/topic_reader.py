@@ -55,7 +55,8 @@ class TopicReader:
     def __init__(self, table: object, network: Network, others: Collection[str] = ()):
         """Check the sources by topic (fields that are measurements) against a network; `others`: nodes left out."""
         self.network, self.others = network, others
-        # What is counted and noted of the messages that come.
+        # What is counted and noted of the messages that come, for notes to the user: `senders`, to find several that
+        # share one count; `clocks`, to compare the clocks of topics.
         self.senders, self.clocks = SenderCounter(), TopicClocks()
         self.unknown = Counter[str]()  # messages of topics that are not in the table, by topic
         self.stored = 0  # a broker's stored messages without a time: they arrive on subscribing, so have no date
@@ -136,7 +137,10 @@ class TopicReader:
         return {name for path in paths for name in (path, path.split(".")[0])}
 
     def list_fields(self, topic: str) -> set[str]:
-        """Return the top-level fields of a topic's messages that sources use: the first words of their paths."""
+        """Return the top-level fields of a topic's messages that sources use: the first words of their paths.
+
+        A source's plant and node may be fields of the message, and a value may be computed from several (`parts`).
+        """
         if topic not in self._fields_of_topic:
             fields = self._fields_of_topic.setdefault(topic, set())
             for mapped in self.of(topic):
@@ -159,6 +163,7 @@ class TopicReader:
         """Return a reading of a message for each source of its topic; an unknown topic has none and is counted.
 
         If a source cannot read the message, an Unread with the reason stands there. A condition may leave it out.
+        `_read_without_values` reads node, count and time of such a message, so that it does not count as lost.
 
         Args:
             topic: the topic of the message.
@@ -188,6 +193,7 @@ class TopicReader:
             reading: what came.
             arrival: when it arrived, in nanoseconds since 1970; None if that is not known.
         """
+        # `_last` has by plant and node the last reading, its moment, and whether its count has ever changed.
         moment = reading.time if arrival is None else arrival
         has_no_seconds = self.time_counts_steps and self.step_seconds is None
         if reading.sequence is None or reading.time is None or moment is None or has_no_seconds:
@@ -198,7 +204,7 @@ class TopicReader:
             self._last[key] = _LastReading(reading, moment, has_count_changed=False)
             return reading
         is_count_repeated = reading.sequence == last.reading.sequence and last.has_count_changed
-        comes_soon_after = 0 <= moment - last.moment <= COPY
+        comes_soon_after = 0 <= moment - last.moment <= COPY  # ten seconds
         has_same_values = np.array_equal(reading.values, last.reading.values, equal_nan=True)
         if is_count_repeated and comes_soon_after and has_same_values:
             return reading._replace(time=last.reading.time)
@@ -236,7 +242,8 @@ class TopicReader:
         # A message with a count may lack values: it measured nothing.
         has_count = sequence is not None and not is_count_absent
         values = np.full(len(self.names[node]), np.nan)
-        # Each value in the output's unit: scale value + offset.
+        # Each value in the output's unit: scale value + offset. `found` and `absent` note which fields came at all and
+        # which did not: one that never comes is misspelt.
         parts = zip(mapped.indices_by_node[node], source.paths, source.scale, source.offset, strict=True)
         for index, path, scale, offset in parts:
             try:
@@ -251,7 +258,11 @@ class TopicReader:
         return Reading(plant, node, sequence, _read_time(source, message, where), values, period)
 
     def _is_left_out(self, source: Source, topic: str, message: object, where: str) -> bool:
-        """Return whether a message is left out, by a field's value or since its device is offline; count it if so."""
+        """Return whether a message is left out, by a field's value or since its device is offline; count it if so.
+
+        `source.where` has by path of a field its allowed values, `source.available` the conditions on devices' own
+        words. A field that is missing is an error.
+        """
         for field, allowed in source.where.items():
             if not is_allowed(field_at(message, field, where), allowed):
                 self.excluded[topic] += 1
@@ -290,7 +301,11 @@ class TopicReader:
         return Reading(plant, node, sequence, time, np.full(len(self.names[node]), np.nan), period)
 
     def _read_message_count(self, source: Source, pattern: str, message: object, where: str) -> tuple[int | None, bool]:
-        """Return a message's running count (None if the source has none), and whether its field is absent (count 0)."""
+        """Return a message's running count (None if the source has none), and whether its field is absent (count 0).
+
+        `self.found` and `self.absent` note which count fields came and which did not, by pattern of topics and path;
+        `check` refuses a count that the declared number of bits cannot hold.
+        """
         if source.sequence is None:
             return None, False
         path = source.sequence.path
@@ -305,7 +320,11 @@ class TopicReader:
 
 
 def _read_names(mapped: MappedSource, topic: str, message: object, where: str) -> tuple[str, str]:
-    """Return the names of a message's plant and node; the plant is "" if there is only one."""
+    """Return the names of a message's plant and node; the plant is "" if there is only one.
+
+    A source gives the node's name itself, or an object whose `of` reads it in the topic or the message, as it does the
+    plant's.
+    """
     source = mapped.source
     node = source.node if isinstance(source.node, str) else source.node.of(topic, message, where)
     plant = "" if source.plant is None else source.plant.of(topic, message, where)

@@ -35,6 +35,7 @@ def query_influx(address: StoreAddress) -> tuple[str, dict[str, Any]]:
 
     The statement in the address is asked in its language; without one all of the address's table is asked for, in
     InfluxQL. Several series, as from GROUP BY, become one table sorted by time, with their tags as columns.
+    `_send_request` returns the body of the answer. A parser makes of it the name and the columns.
 
     Raises:
         ValueError: the server does not answer or refuses, or nothing came.
@@ -106,6 +107,8 @@ def _batch_protocol_lines(
     """Yield (body, rows): bodies of requests of about BATCH bytes in line protocol, each with its number of rows.
 
     A line is "TABLE,plant=PLANT NAME=VALUE,... NANOSECONDS". A row without any finite number has no line, but counts.
+    `columns`: values by name (rows,). `moments`: times of the rows. `_escape_name` puts backslashes before signs that
+    would end a name.
     """
     key = _escape_name(table, ", ") + (f",plant={_escape_name(plant, ', =')}" if plant else "")
     names = [_escape_name(name, ", =") for name in columns]
@@ -165,7 +168,10 @@ def _send_request(address: StoreAddress, method: str, target: str, body: bytes |
 
 
 def _make_headers(address: StoreAddress) -> dict[str, str]:
-    """Return the headers of a request: the user and password or the token, and for Flux also the content types."""
+    """Return the headers of a request: the user and password or the token, and for Flux also the content types.
+
+    `address`: the server, with the language of its query.
+    """
     user, password = address.user_and_password
     if address.language == "flux":
         token = f"{user}:{password}" if user else password  # version 1 takes both as one token

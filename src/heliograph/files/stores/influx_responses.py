@@ -133,6 +133,8 @@ def _join_flux_rows(address: StoreAddress, rows: Iterable[dict[str, Any]]) -> tu
 def _join_row_with_tags(address: StoreAddress, tags: Row, columns: Row) -> dict[str, Any]:
     """Return {**tags, **columns}: a row's columns with its tags (names and texts that InfluxDB gives a whole series).
 
+    `address`: the store, for errors.
+
     Raises:
         ValueError: a tag and a column have the same name and different values, so that one would be lost.
     """
@@ -146,7 +148,8 @@ def _join_row_with_tags(address: StoreAddress, tags: Row, columns: Row) -> dict[
 def _yield_flux_rows(text: str) -> Iterable[dict[str, Any]]:
     """Yield the rows of all tables by name of the column, with values of the columns' types; empty ones are None.
 
-    A table has a line of types, one of names, its rows, and then an empty line.
+    A table has a line of types, one of names, its rows, and then an empty line. READ maps a type to the function that
+    reads its cells.
     """
     types: list[str] = []
     names: list[str] = []  # of the columns of this table; [] until they come

@@ -52,7 +52,8 @@ def write_postgres(address: StoreAddress, columns: Mapping[str, np.ndarray], pla
 
     The table has the columns `plant` (text) and `time` (timestamptz, or numbers), and the other `columns`. Rows of this
     plant from the first to the last of the times are deleted first, so that a repeated call changes nothing. All or
-    nothing is written.
+    nothing is written. LONGEST is 63 bytes, beyond which PostgreSQL cuts names; TYPES maps NumPy's kinds to types of
+    columns.
 
     Args:
         address: the store, and the table.

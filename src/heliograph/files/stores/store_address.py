@@ -78,6 +78,8 @@ def parse_store(url: str) -> StoreAddress:
     What follows `query=`, of InfluxDB also `flux=` or `sql=`, is the statement to its end, & included; a % in it is
     written %25. Of PostgreSQL other parameters, as sslmode=require, are the server's; of InfluxDB 2 org=NAME is known.
 
+    ASKS splits the URL before a statement; ASKED is the text of what is expected.
+
     Raises:
         ValueError: another kind of URL, no database, both table and query; one line without the password.
     """
@@ -111,6 +113,8 @@ def parse_store(url: str) -> StoreAddress:
 
 def _split_location(location: str) -> SplitResult:
     """Return the parts of a store's URL without its statement: scheme, host, path (the database) and options (`query`).
+
+    INFLUX and POSTGRES are the known schemes; ESCAPED and SHAPE are texts of what is expected.
 
     Raises:
         ValueError: another scheme, no database, no host of InfluxDB, an @ or / of a password that is not escaped.

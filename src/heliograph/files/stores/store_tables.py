@@ -59,7 +59,10 @@ class StoreTable:
 
 
 def _convert_cell(cell: object) -> object:
-    """Return a cell as a message in JSON would have it: dates as text, short decimal numbers as floats."""
+    """Return a cell as a message in JSON would have it: dates as text, short decimal numbers as floats.
+
+    Short are DIGITS (15), which a double gives back.
+    """
     if isinstance(cell, np.datetime64):
         return f"{cell}Z"
     if isinstance(cell, date):  # `datetime` is a `date`, too
@@ -71,6 +74,8 @@ def _convert_cell(cell: object) -> object:
 
 def query_store(address: StoreAddress) -> StoreTable:
     """Return the rows of a store's query or table.
+
+    The reader of the store's kind returns the name of the measurement or database, and the columns.
 
     Raises:
         ValueError: the server does not answer or refuses, there are no rows, or the URL has neither query nor table.
@@ -136,15 +141,21 @@ def write_columns_to_store(
 def read_store(url: str) -> dict[str, np.ndarray]:
     """Read a table of InfluxDB or PostgreSQL: the rows of a query, or of a whole table.
 
-    `influx://host:8086/database?query=SELECT ...` asks in InfluxQL, over HTTP (`influxs://` over TLS), by the endpoint
-    that versions 1, 2 (a bucket by its name) and 3 have; `?org=NAME&flux=from(...` of version 2 in Flux, `?sql=SELECT`
-    of version 3 in SQL; `postgresql://user@host/database?query=SELECT ...` in SQL, in a transaction that only reads;
-    `?table=NAME` is all of a table, or measurement. What follows `query=`, `flux=` or `sql=` is the statement to its
-    end, with % as %25. User and password, or a token alone as password, of InfluxDB stand in the URL or in
-    HELIOGRAPH_STORE_USER and HELIOGRAPH_STORE_PASSWORD; of PostgreSQL also where libpq looks.
+    The scheme of the URL chooses server and transport, what follows `?` says what is read:
+
+    - `influx://host:8086/database?query=SELECT ...` asks InfluxDB in InfluxQL, over HTTP; `influxs://` over TLS
+    - `influx://host/database?org=NAME&flux=from(...` asks version 2 in Flux, `?sql=SELECT ...` version 3 in SQL
+    - `postgresql://user@host/database?query=SELECT ...` asks in SQL, in a transaction that only reads
+    - `?table=NAME` in place of a statement reads all of a table, or of a measurement of InfluxDB
+
+    Versions 1, 2 (where a bucket is the database) and 3 of InfluxDB answer to InfluxQL.
+
+    The statement goes to the end of the URL, & included; a % in it is written %25. User and password of InfluxDB, or a
+    token alone as password, stand in the URL or in HELIOGRAPH_STORE_USER and HELIOGRAPH_STORE_PASSWORD; those of
+    PostgreSQL may also stand where libpq looks.
 
     Args:
-        url: where to ask, and what.
+        url: kind of the store, server, database, and the statement or the table that is read.
 
     Returns:
         Columns by name, each of shape (rows,): numbers as float64, NaN where there is none; dates as datetime64[ns] in

@@ -44,11 +44,14 @@ def read_csv_blocks(
             yield columns.read([lines])
         else:
             yield _read_csv_lines(text, columns, lines)
-    yield columns.read(text.end())
+    yield columns.read(text.end())  # rows of a quote that was never closed
 
 
 def _read_csv_lines(text: CsvReader, columns: "CsvColumnReader", lines: bytes) -> TableRows:
     """Return the rows in a block of whole lines: fast, all at once, if they are plain numbers, else cell by cell.
+
+    `text.header` has the names of the columns, [] before the header came; `text.number` counts the rows.
+    `parse_numeric_lines` returns None unless all cells are plain numbers.
 
     Args:
         text: splits lines into cells and knows the header; it is open while a quoted cell goes on in the next line.
@@ -212,7 +215,7 @@ class CsvColumnReader:
         """Return the number in a cell, NaN if it is empty.
 
         Unless reading is strict, infinity is an error: it would make the column one of doubles, in which large integers
-        lose their last digits.
+        lose their last digits. `row`, `name`: place of the cell, for errors.
         """
         number = parse_cell(row.where, name, cell, self.path)
         if not self._strict and np.isinf(number):
@@ -233,7 +236,7 @@ class CsvColumnReader:
     def _parse_date(self, row: CsvRow, name: str, cell: str) -> int:
         """Return a date as nanoseconds since 1970; raise if some dates of a column have a time zone and others not.
 
-        `self._zoned` says for each column whether its first date has a zone.
+        `self._zoned` says for each column whether its first date has a zone. `row`, `name`: place of the cell.
         """
         where = f"{row.where}, column {name!r}"
         moment, zoned = parse_moment(cell, where)
@@ -245,7 +248,8 @@ class CsvColumnReader:
         """Return a column as dates, as int64 or as floats.
 
         int64 is used if all cells are integers and one reaches EXACT (2^53), from where doubles skip integers. NAT
-        stands for an empty cell among dates and among int64.
+        stands for an empty cell among dates and among int64. WHOLE matches an integer that 64 bits hold, also written
+        as 7.0.
 
         Args:
             name: name of the column; `self._dated` says whether it holds dates.

@@ -90,7 +90,8 @@ def _convert_column(values: Any, name: str) -> np.ndarray:
     """Return one column as numbers or dates; what its own kind marks as missing becomes NaN or NaT.
 
     Tables may be pandas, Arrow, NumPy or plain lists; each kind marks missing values in its own way. Whole numbers keep
-    all digits, also those that doubles do not have. `name`: of the column, for errors.
+    all digits, also those that doubles do not have. `name`: of the column, for errors. In the type codes of NumPy, M is
+    a date, f i u b are numbers and O U T objects and texts.
     """
     numbers = _convert_masked_numbers(values)
     if numbers is not None:
@@ -126,7 +127,10 @@ def _convert_masked_numbers(values: Any) -> np.ndarray | None:
 
 
 def _make_array(values: Any) -> np.ndarray:
-    """Return a column as a NumPy array; of objects if it is a list with integers that doubles cannot hold."""
+    """Return a column as a NumPy array; of objects if it is a list with integers that doubles cannot hold.
+
+    Doubles hold integers up to EXACT, 2^53.
+    """
     if hasattr(values, "to_numpy"):
         return np.asarray(values.to_numpy())
     if type(values) is np.ndarray and values.dtype.kind == "O":

@@ -23,7 +23,11 @@ class TableRows(NamedTuple):
 
 
 def join_rows(parts: Iterable[TableRows]) -> TableRows:
-    """Return the rows of several parts of a table, one after the other."""
+    """Return the rows of several parts of a table, one after the other.
+
+    A part has columns by name, the rows' numbers in the file, and errors of refused rows; all parts have the same
+    columns.
+    """
     parts = list(parts)
     # A part without rows does not tell the kinds of its columns. It is used only if all parts are empty.
     filled = [part for part in parts if len(part.numbers)] or parts[-1:]
@@ -78,6 +82,7 @@ def convert_to_numbers(column: np.ndarray, missing: np.ndarray | None = None) ->
     """Return numbers as float64, or as int64 if integers are too large for exact doubles.
 
     A missing number becomes NaN in float64, and MISSING in int64, which therefore holds no number as small as this.
+    EXACT is 2^53, up to which doubles hold every integer.
 
     Args:
         column: numbers of any type.

@@ -100,7 +100,8 @@ def _format_cells(column: np.ndarray) -> list[str]:
 
     Floats are written by a JSON encoder, which takes a tenth of the time and gives the same digits. The text is
     corrected where Python writes it differently: exponents of one digit, numbers for which only one of the two uses an
-    exponent, NaN and infinity.
+    exponent, NaN and infinity. WITH_EXPONENT and LARGE are the absolute values between which, and from which on, the
+    two differ.
     """
     if column.dtype.kind != "f":
         return list(map(str, _convert_to_plain(column).tolist()))
@@ -121,6 +122,7 @@ def predict_name_read_back(name: str) -> str:
     """Return the name that a column has when it is read from the CSV file to which it was written.
 
     Cells cannot hold every name: characters that cannot be printed are written as codes, blanks at the ends are lost.
+    `quote_for_cell` writes it as a spreadsheet may safely show it, `unquote_cell` undoes that.
     """
     return unquote_cell(quote_for_cell(name).strip())
 

@@ -93,7 +93,11 @@ def suggest_recoding(path: Path | None, line: str) -> str:
 
 
 def guess_meaning_of_cell(cell: str, name: str, path: Path | None) -> str:
-    """Return what a cell that is not a number probably means, and the call that rewrites the table; "" if unknown."""
+    """Return what a cell that is not a number probably means, and the call that rewrites the table; "" if unknown.
+
+    DAY_FIRST matches such a date: day or month, separator, the other. `name`: of its column. `path`: the table's file,
+    None if it cannot be rewritten.
+    """
     # In 21.11.2026 and 11/21/2026, the day comes first if it cannot be a month, or if full stops separate the parts.
     if day := DAY_FIRST.fullmatch(cell):
         first = int(day[1]) > 12 or (day[2] == "." and int(day[3]) <= 12)
@@ -122,7 +126,10 @@ def _suggest_separator(path: Path, mark: str) -> str:
 
 
 def _suggest_without_comments(path: Path, encoding: str = "") -> str:
-    """Return the pandas call that converts a table whose first lines are comments, the last maybe its header."""
+    """Return the pandas call that converts a table whose first lines are comments, the last maybe its header.
+
+    COMMENTS are the marks # and %, SEPARATORS those between cells besides the comma.
+    """
     with open_text(path) as file:
         lines = [line.strip() for line in file.read(100_000).splitlines() if line.strip()]
     # The first line that is no comment tells the separator.

@@ -107,7 +107,8 @@ class CsvReader:
         """Return the row of these cells, or the error why they are no row, in a list.
 
         The list is empty for an empty line, an annotation of Influx and a header, which sets `self.header`. `broken`:
-        what is wrong with the line, if this is known already.
+        what is wrong with the line, if this is known already. `self.number` counts the rows behind the header.
+        ANNOTATIONS are the words that begin such a line.
 
         Raises:
             ValueError: the header names no columns, or a column twice.
@@ -134,7 +135,8 @@ class CsvReader:
     def _find_row_error(self, where: str, cells: list[str]) -> InputError | None:
         """Return the error if the cells are no row of this table, or None if they are one.
 
-        A line that begins with # is a comment, unless `self._marked` allows such rows.
+        A line that begins with # is a comment, unless `self._marked` allows such rows. `suggest_recoding` and
+        `suggest_rewrite` return the call of pandas that rewrites the file, for the error's text.
         """
         line = ",".join(cells)
         if not is_valid_text(line):
@@ -179,6 +181,7 @@ def parse_cell(where: str, name: str, cell: str, path: Path | None) -> float:
     """Return the number in a cell: 1 for true and 0 for false, NaN if it is empty or a word for no value (NO_VALUE).
 
     `where` and `name` are the cell's row and column, for the error. `path` is the table's file, if it can be rewritten.
+    FLAGS maps "true" and "false" to their values.
 
     Raises:
         ValueError: the cell holds no number. The error says what is probably meant.

@@ -43,6 +43,7 @@ def find_extension(path: Path) -> str:
     """Return the extension of a file in small letters; where the name does not tell, what the file's text begins like.
 
     It is that before .gz of a packed file, ".csv" of a table in a .txt, and CANDUMP of frames of a CAN bus in a .log.
+    PACKED is .gz.
     """
     if path.suffix.lower() == ".log" and path.is_file() and _begins_as_frames(path):
         return CANDUMP
@@ -65,7 +66,10 @@ def _begins_as_table(path: Path) -> bool:
 
 
 def _begins_as_frames(path: Path) -> bool:
-    """Return whether the first line of a text is a frame of a CAN bus: "(1790000000.020000) can0 1A0#100E0100"."""
+    """Return whether the first line of a text is a frame of a CAN bus: "(1790000000.020000) can0 1A0#100E0100".
+
+    FRAME is the pattern of how such a line begins.
+    """
     try:
         with open_text(path) as text:
             return FRAME.match(next((line.strip() for line in text if line.strip()), "")) is not None
@@ -74,7 +78,10 @@ def _begins_as_frames(path: Path) -> bool:
 
 
 def guess_encoding(start: bytes) -> str:
-    """Return the encoding of a text by its first two bytes: UTF-16 by its mark or by a NUL beside a letter."""
+    """Return the encoding of a text by its first two bytes: UTF-16 by its mark or by a NUL beside a letter.
+
+    WIDE are the two marks of UTF-16; "utf-8-sig" is UTF-8, with its mark or without.
+    """
     if start.startswith(WIDE):
         return "utf-16"
     first_byte, second_byte = (*start[:2], 1, 1)[:2]  # a shorter text is filled up with 1, which is not NUL
@@ -91,6 +98,8 @@ def is_valid_text(line: str) -> bool:
 @contextmanager
 def open_text(path: Path) -> Iterator[TextIO]:
     """Open a text file in UTF-8 or UTF-16, packed or not; bytes that are no valid text are escaped or replaced.
+
+    DAMAGE are the errors of a damaged packed file; WIDE are the marks of UTF-16, by which the encoding is guessed.
 
     Raises:
         CutOffError: a packed file is damaged or was cut off; raised when reading reaches this place.
@@ -158,6 +167,9 @@ def _read_bytes_of_part(file: "gzip.GzipFile | BufferedReader", size: int) -> tu
 
 def _open_unpacked(file: BinaryIO) -> "gzip.GzipFile | BufferedReader":
     """Return a file to read the text from: the file itself, or one that unpacks it if it is packed by gzip.
+
+    GZIP are the first bytes of a packed file. OTHER_KINDS maps those of other files to what they are; `peek` looks at
+    bytes without taking them.
 
     Raises:
         ValueError: the file's first bytes are those of another kind (OTHER_KINDS).

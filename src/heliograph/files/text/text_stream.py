@@ -39,7 +39,8 @@ class TextStream:
         """Return the text, as UTF-8, that these bytes complete; `ended`: no more bytes will come.
 
         The first bytes are collected in `self._start` until they tell the encoding. Packed bytes are unpacked and read
-        by `self._inside`. UTF-16 is decoded by `self._decode`. Anything else is UTF-8 already.
+        by `self._inside`. UTF-16 is decoded by `self._decode`. Anything else is UTF-8 already. `self.has_more`: packed
+        bytes wait to be unpacked.
 
         Raises:
             ValueError: the bytes are no text.
@@ -59,7 +60,8 @@ class TextStream:
     def _may_be_no_text(start: bytes) -> bool:
         """Return whether these first bytes may be the beginning of another kind of file, or of packed text or UTF-16.
 
-        Then more bytes are needed to choose how the text is read.
+        Then more bytes are needed to choose how the text is read. These are the marks GZIP and WIDE, and those of
+        OTHER_KINDS.
         """
         marks = (*OTHER_KINDS, GZIP, *WIDE, codecs.BOM_UTF8)
         return len(start) < len(WIDE[0]) or any(mark.startswith(start) for mark in marks if len(start) < len(mark))
@@ -82,7 +84,8 @@ class TextStream:
     def _unpack_bytes(self, data: bytes, ended: bool) -> bytes:
         """Return the next part, of some AT_ONCE bytes, of what is packed in these bytes and in those that waited.
 
-        Nothing comes after damage, which `self.broken` describes. `ended`: no more bytes will come.
+        Nothing comes after damage, which `self.broken` describes. `ended`: no more bytes will come. `self._packed` has
+        the bytes that waited; `self._in_member` says whether a packed file has begun and not ended.
         """
         packed, results = (self._packed or b"") + data, b""
         try:

@@ -113,15 +113,20 @@ class Climbs(NamedTuple):
 def join_climbs(state: Climbs, moving: np.ndarray, domains: OpenEnds) -> Climbs:
     """Return the state in which each climb a is ended that goes to the same top as a higher climb b.
 
-    Two climbs to one top cost twice as much. Both are within JOINING_DISTANCE standard errors of a top and of each
-    other, by the information I of either, and less than NEIGHBOUR_DISTANCE apart in every logarithm and logit. Between
-    them, along d = x_b - x_a, the log-likelihood l is concave: l_b - l_a is (g_a + g_b)' d / 2 as of a quadratic with
-    gradients g, and (g_a - g_b)' d >= LEAST_BEND d' I d.
+    A climb is a search for a maximum of the log-likelihood l; several run side by side, and two to one top cost twice
+    as much. Both are within JOINING_DISTANCE standard errors of a top and of each other, by the information I of
+    either, and less than NEIGHBOUR_DISTANCE apart in every logarithm and logit. Between them, along d = x_b - x_a, l is
+    concave: l_b - l_a is (g_a + g_b)' d / 2 as of a quadratic with gradients g, and (g_a - g_b)' d >= LEAST_BEND d' I
+    d.
+
+    The result differs in `joined` (the number of b for each a that ends, else as before) and in `done`.
+    UNEXPLAINED_GAIN (0.1) is the share of the gain that the quadratic may leave unexplained, NOISE the rounding of l.
 
     Args:
-        state: the climbs, with points x, log-likelihoods l, gradients g and information I.
+        state: the climbs: points x, values l (`total`), gradients g, information I; `remaining`, what a full step would
+            gain, g' I^-1 g / 2; and which have ended (`done`) or `joined` another.
         moving: coordinates that move (climbs, p).
-        domains: which coordinates are logarithms or logits, and which plain real numbers.
+        domains: `free` is True for coordinates that are plain real numbers, not logarithms or logits.
     """
     climbs = np.arange(len(state.x))
     g = np.nan_to_num(state.gradient)

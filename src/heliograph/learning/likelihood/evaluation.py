@@ -92,12 +92,16 @@ def _evaluate_in_chunks(objective: Objective, x: np.ndarray, data: LikelihoodDat
     A chunk is a part of a long recording that is filtered apart, which is possible if the filter forgets its start. It
     is not done where recordings are short, true states are learned from, or the filter forgets too late.
 
+    Recursions over rows give log densities, their scores (gradients by x), and `halves`, the information (2, p, p)
+    summed over the first and over the second half of the rows: by row, or summed over all rows.
+
     Args:
         objective: makes the filter from the free numbers.
         x: the free numbers as unconstrained coordinates (p,).
         data: the recordings.
         by_row: whether densities and scores of each row are needed; else they are sums over all rows, one block.
     """
+    # Only a linear filter has such a recursion, `score_rows`; None for others.
     linear = _find_linear_filter(objective) if data.truth is None else None
     if linear is None:
         return None
@@ -106,11 +110,12 @@ def _evaluate_in_chunks(objective: Objective, x: np.ndarray, data: LikelihoodDat
     by_recording = []
     for z, u in zip(data.measurements, data.inputs, strict=True):
         evaluated = recursion.scan_long(z, u) if by_row else recursion.sum_long(z, u)
-        if evaluated is None:
+        if evaluated is None:  # too short, or slow to forget
             return None
         by_recording.append(evaluated)
+    # (recordings, rows), (recordings, rows, p), (recordings, 2, p, p); without the axis of rows if these were summed.
     density, score, halves = (np.stack(leaves) for leaves in zip(*by_recording, strict=True))
-    # A leading axis for the one point; sums over all rows count as one row.
+    # Information is summed over recordings. A leading axis for the one point; sums over all rows are one block.
     whole = Evaluation(density=density[None], score=score[None], halves=halves.sum(axis=0)[None])
     return whole if by_row else whole._replace(density=density[None, :, None], score=score[None, :, None])
 

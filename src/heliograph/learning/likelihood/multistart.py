@@ -83,11 +83,14 @@ class MaximumSearch:
 
         Climbs begin at all starts, then at as many points around the best, and near the low end of each interval. In a
         long recording most climbs go most of the way by its first rows; the maximum is one of all rows.
+        SAME_LIKELIHOOD: 1e-6 nats, less than which is no higher top.
 
         Args:
             starts: where to begin (starts, p); from a single one there is a single climb.
             seed: seed of the second round.
         """
+        # `_prove_maximum` takes the highest end of the climbs, puts numbers at ends of their domains that belong there,
+        # and climbs on from saddles until the Hessian shows a maximum.
         no_ends = np.zeros(starts.shape[1])  # no coordinate is held at an end of its domain
         climbed = self._climb_by_first_rows(starts, no_ends, own=0)
         top = self._prove_maximum(climbed)
@@ -110,6 +113,8 @@ class MaximumSearch:
         A point is a maximum if two conditions hold. For numbers inside their domains, g' H^-1 g is negligible and H is
         not indefinite, with g the gradient of the log-likelihood l and H the Hessian of -l. For numbers that were put
         at an end of their domain, l does not rise on the way back inside. `climbed`: where the climbs ended.
+        `_move_to_limits` puts numbers at ends of their domains that the data hardly see. A reason is a text, "" for a
+        maximum.
         """
         no_ends = np.zeros(climbed.x.shape[1])
         top = _take_best_climb(climbed, no_ends)
@@ -192,7 +197,8 @@ class MaximumSearch:
     def _climb(self, starts: np.ndarray, ends: np.ndarray) -> ClimbEnds:
         """Return the ends of climbs from all starts (starts, p); coordinates that are not 0 in `ends` are held fixed.
 
-        The best point so far is kept at each step.
+        The best point so far is kept at each step. `watch` shows the progress. With `joining`, a climb ends where a
+        higher one goes to the same top.
         """
 
         def keep_best(now: ClimbEnds) -> None:
@@ -214,7 +220,9 @@ class MaximumSearch:
         """Return the point with those numbers at an end of their domain that the data hardly see, climbed anew.
 
         A number is put there if the likelihood is the same there as where the climb ended. The data hardly see a number
-        whose logarithm or logit has an information below HARDLY_SEEN. `top`: the highest point so far.
+        whose logarithm or logit has an information below HARDLY_SEEN. `top`: the highest point so far. `domains.single`
+        marks numbers on an interval, of which `domains.high` have an end at infinity too; there WAY_TO_END further
+        steps are as good as the end. `ends` is -1 or 1 for a number at its low or high end.
         """
         domains = self.surface.domains
         x = top.x.copy()
@@ -239,7 +247,7 @@ class MaximumSearch:
         A maximum gives (None, ""). It is none if l rises by more than SAME_LIKELIHOOD on the way inside from an end of
         a domain, or if the least curvature is below SADDLE_CURVATURE (negative): both give points to climb from. It is
         also none if Newton's step promises a gain of CONVERGED_GAIN_BY_ROUNDING or more; no points help then, and the
-        reason says so.
+        reason says so. `curvature.least` is the least curvature of -l in units of standard errors, along `direction`.
         """
         # For each number at an end of its domain: climb again if l rises on the way back inside.
         for index in np.flatnonzero(top.ends):

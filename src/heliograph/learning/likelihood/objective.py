@@ -29,7 +29,8 @@ from heliograph.simulation.node import Node
 def join_all_nodes(network: Network) -> tuple[AnyPlant, AnySensor, Channel]:
     """Return the plant, and the sensor and channel of all nodes together in their order, if all packets arrive.
 
-    A fit takes what all nodes receive as one measurement, since their sensors see one state.
+    A fit takes what all nodes receive as one measurement, since their sensors see one state. `join_links` stacks
+    sensors and channels side by side. A network with one channel for all nodes has it as `common`.
 
     Raises:
         ValueError: relays that filter and forward, sensors with feedback, senders of words (a sensor with a resolution
@@ -108,9 +109,10 @@ class Objective:
     def compute_innovations(self, x: Array, z: Array, u: Array) -> tuple[jax.Array, jax.Array]:
         """Return the filter's innovations (steps, m), NaN where nothing arrived, and their covariances (steps, m, m).
 
-        The filter has the free numbers at x (p,), and runs over measurements z (steps, received) and inputs u
-        (steps, inputs). Where the estimate is no number the innovation is 0 and its covariance NaN, so that the
-        likelihood is NaN there, and not that of a row in which nothing arrived.
+        The filter has the free numbers at x (p,), and runs over measurements z (steps, received) and inputs u (steps,
+        inputs). Where the estimate is no number the innovation is 0 and its covariance NaN, so that the likelihood is
+        NaN there, and not that of a row in which nothing arrived. `filter.scan(z, u, judged)` runs the filter over all
+        rows and stacks what `judged` returns of each.
         """
         filter = self.filter(x)
 
@@ -131,7 +133,7 @@ class Objective:
         """Return the errors (steps, n) of the estimates by the filter at x (p,), and the covariances that they claim.
 
         Errors are NaN where the truth is not known. z: measurements (steps, received). u: inputs (steps, inputs).
-        `truth`: true states (steps, n).
+        `truth`: true states (steps, n). Errors of angles are taken the short way around (`wrap_near`).
         """
         filter = self.filter(x)
         angles = first(self.description.start.plant).angles
@@ -151,7 +153,7 @@ class Objective:
 def _list_code_and_closure(build: Build) -> tuple[object, ...]:
     """Return what makes two functions equal: their code, defaults and the values they close over.
 
-    Any other callable is compared by itself.
+    Any other callable is compared by itself. `build`: the user's function that returns the network.
     """
     if not isinstance(build, FunctionType):
         return (build,)
@@ -188,8 +190,8 @@ def _reuse_equal_objective(objective: Objective) -> Objective:
 def choose_typical_network(description: Description) -> Network:
     """Return the network at its start, or near it if a gain is random there but not at the start itself.
 
-    A gain is random only near the start if its variance is free and starts at 0: for instance a gain that is one of
-    two free values which start equal.
+    A gain is random only near the start if its variance is free and starts at 0: for instance a gain that is one of two
+    free values which start equal. `near_start` is the network a little away from the start.
     """
     start = description.start
     if _has_random_gain(start) or not _has_random_gain(description.near_start):
@@ -212,7 +214,8 @@ def list_forms(description: Description) -> list[Form]:
 
     The linear form uses the unconditional moments of the state, the conditional form those given the data. Models that
     are not linear, or have angles (`circular`), have only the conditional form; packets may then not be late
-    (`link.past`: by how many steps).
+    (`link.past`: by how many steps). `is_linear`: plant and sensor are linear. A random gain is one with a variance
+    that the receiver does not know.
     """
     plant, sensor, channel = join_all_nodes(description.start)
     link = first(channel)  # the channel of the first step, if it varies; its kind is the same at all
@@ -225,7 +228,11 @@ def list_forms(description: Description) -> list[Form]:
 
 
 def make_filter_of_form(network: Network, form: Form) -> AbstractFilter:
-    """Return the filter of all that a network receives whose likelihood has this form, or its own for "truth"."""
+    """Return the filter of all that a network receives whose likelihood has this form, or its own for "truth".
+
+    "linear" filters by the moments of the gains before any data, "conditional" by those given the data;
+    `likelihood_filter` makes either for the joined channel of all nodes.
+    """
     if form == "truth":
         return find_sole_filter(network)
     plant, sensor, channel = join_all_nodes(network)

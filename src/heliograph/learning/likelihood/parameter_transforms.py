@@ -16,7 +16,7 @@ def map_to_unconstrained(name: str, domain: Domain, value: Float[np.ndarray, "..
 
     A number of an interval becomes v, its logarithm log(v - low) or its logit, as the interval has ends. A simplex
     becomes log(p_i / p_last). A covariance becomes the entries of its Cholesky factor, row after row, with logarithms
-    on the diagonal.
+    on the diagonal. `domain.kind` says which of these it is; an interval goes from `domain.low` to `domain.high`.
 
     Raises:
         ValueError: a start that is not inside the domain.
@@ -83,7 +83,8 @@ def _map_to_simplex(shape: tuple[int, ...], x: Array) -> Array:
 def to_unconstrained(domain: Domain, value: PyTree) -> PyTree:
     """Return an unconstrained number for one of an interval: its logit if that has two ends, else its logarithm.
 
-    The logarithm is of the distance from the only end. Without ends the number stays as it is.
+    The logarithm is of the distance from the only end. Without ends the number stays as it is. `domain`: an interval
+    from `low` to `high`, infinite where it has no end.
     """
     if np.isfinite(domain.low) and np.isfinite(domain.high):
         return np.log((value - domain.low) / (domain.high - value))
@@ -93,7 +94,10 @@ def to_unconstrained(domain: Domain, value: PyTree) -> PyTree:
 
 
 def from_unconstrained(domain: Domain, value: PyTree) -> PyTree:
-    """Return the number of the interval that `to_unconstrained` maps to this value; an infinite value gives an end."""
+    """Return the number of the interval that `to_unconstrained` maps to this value; an infinite value gives an end.
+
+    `domain`: an interval from `low` to `high`, infinite where it has no end.
+    """
     with np.errstate(over="ignore"):
         if np.isfinite(domain.low) and np.isfinite(domain.high):
             return domain.low + (domain.high - domain.low) / (1 + np.exp(-value))
@@ -105,7 +109,8 @@ def from_unconstrained(domain: Domain, value: PyTree) -> PyTree:
 def slope_from_unconstrained(domain: Domain, value: PyTree) -> PyTree:
     """Return the derivative of `from_unconstrained` at an unconstrained value.
 
-    By the chain rule it takes an error of the unconstrained value to one of the number.
+    By the chain rule it takes an error of the unconstrained value to one of the number. `domain`: an interval from
+    `low` to `high`, infinite where it has no end.
     """
     if np.isfinite(domain.low) and np.isfinite(domain.high):
         return (domain.high - domain.low) / (2 * np.cosh(value / 2)) ** 2
@@ -117,7 +122,8 @@ def slope_from_unconstrained(domain: Domain, value: PyTree) -> PyTree:
 def slope_to_unconstrained(domain: Domain, value: PyTree) -> PyTree:
     """Return the derivative of `to_unconstrained` at a number of the interval.
 
-    By the chain rule it takes an error of the number to one of its logarithm or logit.
+    By the chain rule it takes an error of the number to one of its logarithm or logit. `domain`: an interval from `low`
+    to `high`, infinite where it has no end.
     """
     if np.isfinite(domain.low) and np.isfinite(domain.high):
         return (domain.high - domain.low) / ((value - domain.low) * (domain.high - value))

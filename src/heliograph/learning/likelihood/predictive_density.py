@@ -239,6 +239,8 @@ def _stack_combinations(components: list[AffineComponent]) -> StackPartDensity:
 def evaluate_predictive(expected: ExpectedSignals, parts: ChannelDensities) -> Predictive:
     """Return the density and the probability integral transform of each measurement, given the steps before.
 
+    `expected` are mean y (steps, p) and covariance P_y (steps, p, p) of the signal, and z (steps, m). ROWS is 256.
+
     Args:
         expected: what is expected of the signal before each step, and what was measured.
         parts: law of each part of the channel, a mixture over the values of its gains.

@@ -84,7 +84,8 @@ class LikelihoodSurface:
     def evaluations(self, x: Float[np.ndarray, "points p"]) -> Evaluation:
         """Return l, scores and information at each point (points, p); the last result is kept for equal points.
 
-        A search asks at the same points for the value, the gradient and the information one after another.
+        A search asks at the same points for the value, the gradient and the information one after another. `self._last`
+        holds the last points with their evaluation.
         """
         if self._last:
             last_points, last_evaluation = self._last[0]
@@ -97,7 +98,8 @@ class LikelihoodSurface:
     def evaluate_rows(self, x: Float[np.ndarray, "points p"]) -> Evaluation:
         """Return the evaluation at points (points, p) with densities and scores by row.
 
-        Results by row are not kept for long recordings.
+        Results by row are not kept for long recordings. For those, only sums over rows were kept, one block, so that
+        they are evaluated again.
         """
         whole = self.evaluations(x)
         # The kept result has every row, unless recordings are long.
@@ -142,6 +144,7 @@ class LikelihoodSurface:
         """Return for each recording each row's observed information on k coordinates, -d(score_k)/dx_k, (steps, k).
 
         By central differences at the point x (p,), over DIFFERENCE_WIDTH standard errors; `coordinates`: their indices.
+        `evaluate_rows(points).score` is (points, recordings, steps, p).
         """
         deviation = self.standard_errors(x)[coordinates]
         # A number without a finite standard error is not moved, and has information 0.
@@ -182,7 +185,8 @@ class LikelihoodSurface:
 
         l is the log-likelihood of the free numbers x (p,). A negative least curvature means that x is no maximum but a
         saddle, from which the search goes on along the direction. Only coordinates with `active` (p,) true count, along
-        directions that the data identify, and lengths are in standard errors.
+        directions that the data identify, and lengths are in standard errors. The gain is infinite if the Hessian is
+        not finite, and 0 if the data identify no direction.
         """
         evaluation = self.evaluations(x[None])
         coordinates = np.flatnonzero(active)
@@ -224,6 +228,9 @@ class LikelihoodSurface:
         The profile at a value is l with all other active coordinates at their best. Its fall is f = sqrt(2 (top - l)),
         linear in the distance t from the maximum where l is quadratic: so t is found by Newton's method for
         f(t) = sqrt(2 drop), kept between a distance known to be inside and one known to be outside.
+
+        At most MOST_CUTS distances are tried. An end that is not found by then is the last one tried; one that lies
+        beyond `furthest` is infinite. ACCURACY_OF_FALL is 1e-3, relative.
 
         Args:
             x: the maximum (p,).
@@ -301,7 +308,8 @@ def _find_ends_at_infinity(parameter: Parameter) -> tuple[Bool[np.ndarray, " siz
     """Return which coordinates of a free number reach an end of its domain at minus infinity, and which at infinity.
 
     Logits (such as of probabilities) have both ends. Logarithms have the end at minus infinity; a covariance has them
-    on its diagonal. A real number without ends has none.
+    on its diagonal. A real number without ends has none. `domain.low`, `domain.high`: ends of an interval, infinite
+    where it has none. A logarithm of the distance from either end has its end at minus infinity.
     """
     domain, none = parameter.domain, np.zeros(parameter.size, dtype=bool)
     if domain.kind == "simplex":

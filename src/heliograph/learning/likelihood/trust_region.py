@@ -142,7 +142,7 @@ def find_coordinates_at_limits(x: np.ndarray, gradient: np.ndarray, domains: Ope
 
     A number v = exp(x) has its end v = 0 at x = -inf (`domains.low`). A logit also has one at x = inf (`domains.high`).
     To first order, the log-likelihood l gains l(0) - l(v) = -v l'(v) = -dl/dx up to the end; a gain below GAIN_TO_LIMIT
-    (1e-6 nats) counts as none.
+    (1e-6 nats) counts as none. `outward` is -1 or 1, the direction of the nearer end, 0 for a real number.
 
     Args:
         x: points (climbs, p).
@@ -159,13 +159,15 @@ def _step_climbs(evaluate: Evaluate, state: Climbs, moving: np.ndarray, domains:
 
     Args:
         evaluate: log-likelihood (climbs,), gradient (climbs, p) and information (climbs, p, p) at points (climbs, p).
-        state: climbs (searches side by side) before the step.
+        state: climbs (searches side by side) before the step: points x, values, gradients g, informations I, models B
+            of minus the Hessian, radii, and which are `done`.
         moving: coordinates that move (climbs, p).
         domains: coordinates whose domains end at infinity.
         close: a climb has arrived where g' I^-1 g of gradient g and information I is below this.
     """
     going = ~state.done
-    # The step p of greatest g' p - p' B p / 2 within the radius; coordinates at an end of their domain stay.
+    # The step p of greatest g' p - p' B p / 2 within the radius, its length in standard errors, and the gain predicted.
+    # Coordinates at an end of their domain stay.
     counting = moving & ~find_coordinates_at_limits(state.x, state.gradient, domains)
     step, length, predicted = trust_region_step(
         state.gradient, state.information, state.model, state.radius, counting, domains.free
@@ -174,6 +176,7 @@ def _step_climbs(evaluate: Evaluate, state: Climbs, moving: np.ndarray, domains:
     total, gradient, information = _evaluate_at(evaluate, tried, going, state)
     # Accept it or not, and adapt the radius, by how well the gain was predicted.
     is_finite = going & _is_finite(total, gradient, information, moving)
+    # `expected_gain` is g' I^-1 g, twice the gain of a full step.
     gradient_fell = expected_gain(gradient, information, counting) < expected_gain(
         state.gradient, state.information, counting
     )
@@ -200,10 +203,11 @@ def _accept_or_reject_steps(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return which climbs accept their step, and the radius for the next one, (climbs,) each.
 
-    A step is accepted where the log-likelihood l rises by a share of the gain that the
-    model predicted. Where that gain is below the rounding of l, the gradient decides: the step is accepted if the
-    gradient fell, or if the step went to the edge of the region, as across a plateau; and l must not fall by more than
-    rounding.
+    A step is accepted where the log-likelihood l rises by a share of the gain that the model predicted. Where that gain
+    is below the rounding of l, the gradient decides: the step is accepted if the gradient fell, or if the step went to
+    the edge of the region, as across a plateau; and l must not fall by more than rounding. The rounding of l is NOISE
+    of its size. After a bad step the radius is NARROWING times the step's length (or the radius, if that is less),
+    after a good one to the edge WIDENING times the old one. LEAST_SHARE_OF_GAIN is 1e-4.
 
     Args:
         state: the climbs before the step, with l (`total`), the radius, and `done` for climbs that go no further.

@@ -65,7 +65,7 @@ def trust_region_step(
     stays = unit == 0
     d = np.where(free | stays, 1.0, np.maximum(1.0, radius[:, None] * unit / LONGEST_LOGARITHM))
     g = np.nan_to_num(gradient) * unit
-    b = _scale_model(model, information, unit)
+    b = _scale_model(model, information, unit)  # u B u, or u I u where B is not finite or huge
     b = (b + b.swapaxes(1, 2)) / 2 + flat @ flat.swapaxes(1, 2) + np.eye(len(free)) * stays[:, :, None]
     # The step on or within the radius; one that is up to a hundredth longer is shortened to it.
     step = _find_step_within(radius, g, b, d)
@@ -93,7 +93,8 @@ def _find_step_within(radius: np.ndarray, g: np.ndarray, b: np.ndarray, d: np.nd
     """Return p = (B + s D^2)^-1 g (climbs, p) with the least shift s >= 0 that keeps |D p| within 1.01 of the radius.
 
     The shift is found by Newton's method for 1 / |D p| = 1 / radius, which is nearly linear in s. It begins at the
-    least s that makes the matrix positive.
+    least s that makes the matrix positive. Eigenvalues above -ROUNDING count as not negative; the first shift lies
+    MARGIN_OF_SHIFT beyond the least one, relative. At most SECULAR_STEPS (20) steps are made.
 
     Args:
         radius: of the trust region (climbs,).
@@ -110,6 +111,7 @@ def _find_step_within(radius: np.ndarray, g: np.ndarray, b: np.ndarray, d: np.nd
         beyond = length > 1.01 * radius
         if not beyond.any():
             break
+        # Newton's step for 1 / |D p| - 1 / radius: |D p|^2 / slope (|D p| - radius) / radius.
         slope = np.sum(d * d * step * _solve_shifted(b, shift, d, d * d * step), axis=1)  # -|D p| d|D p| / ds
         newton = length**2 / np.where(beyond, slope, 1.0) * (length - radius) / radius
         shift = np.where(beyond, shift + newton, shift)
@@ -140,7 +142,8 @@ def expected_gain(
     """Return g' I^-1 g (climbs,), twice what a full step gains: gradient g (climbs, p), information I (climbs, p, p).
 
     Only coordinates marked in `counting` (climbs, p) and identified directions count. A direction with an eigenvalue of
-    at most FLAT_EIGENVALUE, in units of standard errors, is not identified.
+    at most FLAT_EIGENVALUE, in units of standard errors, is not identified. The matrix is solved in units of standard
+    errors, in its eigenvectors.
 
     Args:
         gradient: g (climbs, p).

@@ -41,10 +41,11 @@ class Delays:
         )
 
     def __str__(self) -> str:
-        """Return one line with each delay in seconds, its probability and its interval.
+        """Return a line with each delay in seconds, its probability and 95 % interval: "late by 1 s 0.9 (0.8 to 0.95)".
 
-        `self.shares`: probability of each delay in steps. `self.step`: seconds of a step. `self.early`: number of
-        measurements logged before their time, which are not counted.
+        `self.shares`: {delay in steps: its probability, with the ends of the interval}. `self.step`: seconds of a step.
+        `self.counted`: number of measurements that were used. `self.early`: number of those that were logged before
+        their time, which are not counted.
         """
         shares = [f"{steps * self.step:g} s {s.estimate:.3g} ({s.low:.2g} to {s.high:.2g})"
                   for steps, s in self.shares.items()]  # fmt: skip

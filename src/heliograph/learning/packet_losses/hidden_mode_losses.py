@@ -68,6 +68,7 @@ class HiddenModeLosses(AbstractLossLaw):
             value_of_ends, gradient_of_ends = ends.likelihood(x)
             return value - value_of_ends, gradient - gradient_of_ends
 
+        # The maximum, then each of the four shares with its interval.
         top, value = maximise_over_shares(likelihood, [*STARTS])
         good, bad, fails, recovers = estimate_shares(likelihood, top, value, intervals)
         if good.estimate > bad.estimate:  # the good mode is the one that loses less
@@ -171,6 +172,8 @@ class FateRuns:
         Complex shares give derivatives: the imaginary part of l(x + i h) is h dl/dx for a tiny h.
 
         `shares`: (sets, 4), in each the losses when good and when bad, and the probabilities to fail and to recover.
+        `self.kind`: the fate of each run in turn, START where a stretch begins. `self.runs_by_kind`: for each kind the
+        indices of its runs, their distinct lengths, and which of these each run has.
         """
         good, bad, fails, recovers = shares.T
         ones = np.ones_like(good)
@@ -204,7 +207,8 @@ def _stack_matrices(rows: list[list[np.ndarray]]) -> np.ndarray:
 def _rescale_matrices(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return matrices (..., 2, 2) divided by their largest real part, and its logarithm (...).
 
-    Without this, products of many matrices would underflow.
+    Without this, products of many matrices would underflow. `matrix` may be complex, as in derivatives by complex
+    steps.
     """
     largest_of_columns = np.maximum(matrix.real[..., 0, :], matrix.real[..., 1, :])
     largest = np.maximum(largest_of_columns[..., 0], largest_of_columns[..., 1])
@@ -237,7 +241,7 @@ def _multiply_runs(matrices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the product of matrices (sets, runs, 2, 2) over runs, the last leftmost, and the log of its scale.
 
     The product is the returned matrix (sets, 2, 2) times its scale (sets,). Each turn multiplies pairs, which halves
-    the number of matrices.
+    the number of matrices. An odd number of matrices is filled up with the identity.
     """
     log_scale = np.zeros(len(matrices))
     while matrices.shape[1] > 1:

@@ -74,7 +74,8 @@ class AbstractLossLaw(Module):
         A fate is 0 (arrived), 1 (lost) or NaN (unknown). If the stretch was cut where packets arrived, its first and
         last fate are CHOSEN: they arrived, but say nothing of losses. The first has NaN. The sum of all entries has to
         be log P(fates between, last arrives | first arrived) - log P(last arrives | first arrived), so the last entry
-        is log P(last arrives | all earlier fates) - log P(last arrives | first arrived).
+        is log P(last arrives | all earlier fates) - log P(last arrives | first arrived). `find_trials` marks fates of 0
+        and 1; `fill_ends` writes 0 in place of CHOSEN.
         """
         p = self.predicted(fill_ends(fate))  # P(lost) of each packet; chosen ends count as arrived for those after them
         with np.errstate(divide="ignore"):
@@ -180,7 +181,7 @@ class MarkovLosses(AbstractLossLaw):
             # divided out below. `np.add.at` counts a past each time that it comes.
             counted = (length == order) & (~np.isnan(stretch) if order == 1 else find_trials(stretch))
             np.add.at(counts, (past[counted], fill_ends(stretch)[counted].astype(int)), 1.0)
-        # Lengths of the stretches, for the division by P(the last packet arrives).
+        # Lengths of the stretches that were cut where packets arrived, for the division by P(the last packet arrives).
         spans = _measure_spans(stretches)
         return _condition_on_ends(counts, spans, intervals) if order == 1 and len(spans) else MarkovLosses(counts)
 
@@ -209,7 +210,8 @@ class MarkovLosses(AbstractLossLaw):
         """Return the probability of each packet's loss, (k + 1/2) / (n + 1) if k of n packets with its past were lost.
 
         The past of a packet are the last fates before it that are known without a gap, at most `order` of them. They
-        are written as a number whose bit 0 is the latest fate (1: lost).
+        are written as a number whose bit 0 is the latest fate (1: lost). `fate` (packets,): 0 arrived, 1 lost, NaN
+        unknown. `counts` (2^order, 2): how many packets arrived and were lost after each past.
         """
         past, length = _number_last_fates(fate, self.order)
         probabilities = np.zeros(len(fate))
@@ -226,6 +228,7 @@ class MarkovLosses(AbstractLossLaw):
         """Return P(a packet arrives | the packet `steps` before it arrived), if nothing is known of those between.
 
         For order 1 it is (b + a (1 - a - b)^steps) / (a + b) with a = P(lost | arrived) and b = P(arrived | lost).
+        `predicted` returns P(lost) of each packet, of which the second is asked.
         """
         if self.order > 1:
             return super()._compute_return_probability(steps)
@@ -241,7 +244,8 @@ class MarkovLosses(AbstractLossLaw):
 
         A mode whose last packet was lost lets nothing pass (an `erasure` that arrives with probability 0), any other
         one is the link. P(lost | past) is the share of losses among the packets with this past, or 1/2 of a past that
-        was never seen.
+        was never seen. `link`: the channel without losses. `gilbert_elliott` and `markov_fading` switch between
+        channels by a Markov chain, of two modes or more.
         """
         arrives, lost = erasure(link, 1.0), erasure(link, 0.0)
         if self.order == 1:

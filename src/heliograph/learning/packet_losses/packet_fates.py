@@ -106,6 +106,9 @@ def fates_of_sequence(
 def _split_at_restarts(received: np.ndarray, jump: int, may_be_copies: bool) -> list[list[int]]:
     """Return the sequence numbers (packets,) as rising stretches, split where the sender restarted.
 
+    `_split_rising` cuts them where a number does not rise; `_are_copies` says whether the repeated numbers of a run are
+    copies of ones received before, rather than new after a restart.
+
     Args:
         received: sequence numbers in the order of arrival.
         jump: a leap ahead by this much or more means a restart.
@@ -151,7 +154,8 @@ def _are_copies(again: list[int], run: list[int], stretch: list[int]) -> bool:
 def _mark_gaps(received: np.ndarray) -> BetweenArrivals:
     """Return the fates of all packets from the first received number to the last; missing numbers were lost.
 
-    `received`: rising sequence numbers.
+    `received`: rising sequence numbers. `BetweenArrivals` marks a stretch whose ends are there because they arrived, so
+    that they are no trials.
     """
     fates = np.ones(received[-1] - received[0] + 1)
     fates[received - received[0]] = 0.0

@@ -70,7 +70,7 @@ def _find_profile_interval(function: LogLikelihood, top: np.ndarray, value: floa
     """Return share i at the maximum of a log-likelihood, with its 95 % interval.
 
     The interval is where the profile of the share has fallen by less than FALL. A share at 0 or 1 is one end of its
-    interval; at the other end the profile has fallen by FALL_AT_END.
+    interval; at the other end the profile has fallen by FALL_AT_END. FURTHEST_LOGIT is 14, where the search is bounded.
 
     Args:
         function: log-likelihood of the logits of all shares, with its gradient.
@@ -95,7 +95,8 @@ def _find_profile_crossing(function: LogLikelihood, top: np.ndarray, level: floa
 
     The profile at a logit is the log-likelihood, largest over all other logits. The crossing is an end of a confidence
     interval of the share, a probability 1 / (1 + exp(-logit)). 0 or 1 is returned where the profile stays above the
-    level up to the end of the domain, -FURTHEST_LOGIT or FURTHEST_LOGIT, on that side.
+    level up to the end of the domain, -FURTHEST_LOGIT or FURTHEST_LOGIT, on that side. FIRST_STEP is 0.25 of a logit;
+    LOGIT_ACCURACY and PROFILE_ACCURACY are those of the crossing and of each profile.
 
     Args:
         function: log-likelihood of the logits and its gradient.

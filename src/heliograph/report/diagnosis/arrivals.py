@@ -65,7 +65,8 @@ class Arrivals:
 
         It is not if the sender's period is declared, or if rows exist because of messages (`of_messages`). A periodic
         pattern of rows, such as 3 of each 4, may also explain the arrivals: of the two, the one with fewer messages due
-        is taken, since fewer were then lost.
+        is taken, since fewer were then lost. `find_rate` returns None if losses at random explain the empty rows;
+        `pattern.rows` marks the rows in which the pattern has a message due.
         """
         if self.declared_period is not None or self.of_messages:
             return None
@@ -85,7 +86,8 @@ class Arrivals:
         It is declared, or that of the sender's own clock (`rate`), or the median interval between arrivals, if a share
         REGULAR of all intervals are whole multiples of it to NEAR periods. (Losses of a sender that is due in each row
         leave intervals of all lengths.) A median of less than SLOWER rows is no period, unless rows exist because of
-        messages (`of_messages`).
+        messages (`of_messages`). `clock` has the times as numbers; `declared_period` and `rate.period` count rows,
+        which are `spacing` apart. Fewer than FEW (8) arrivals tell no period.
         """
         clock = _convert_times_to_numbers(self.time)
         spacing = float(np.median(np.diff(clock))) if len(clock) > 1 else 0.0
@@ -108,6 +110,7 @@ class Arrivals:
         """Whether a message came in each slot: each row, or of a slow sender each period from its first arrival on.
 
         None if rows are there because of other nodes' messages and this sender has no period: its slots are unknown.
+        `self.rate.slots` numbers the arrivals among the slots, if the sender has a rate of its own.
         """
         if self.period is None:
             return None if self.of_messages and not self.arrived.all() else self.arrived
@@ -141,7 +144,11 @@ class Arrivals:
 
     @property
     def due_in(self) -> str:
-        """Return in words when a message is due: "each row", "3 of 4 rows", "each 0.1", "3 of 4, each 0.1"."""
+        """Return in words when a message is due: "each row", "3 of 4 rows", "each 0.1", "3 of 4, each 0.1".
+
+        `self.slots` are the rows, or the periods of a slow sender, in which a message may be due; None if unknown.
+        `self.pattern` says in which of them one is due, None for all.
+        """
         if self.slots is None:
             return "not known"
         pattern = None if self.pattern is None else f"{self.pattern.due} of {self.pattern.length}"
@@ -154,8 +161,10 @@ class Arrivals:
         """Times at which a message was due and did not come: times of rows, or between them for a slower sender.
 
         `slots`: whether a message came in each row, or, of a sender slower than the rows, in each `period`.
+        `self.arrived` (rows,) and `self.time` are those of the rows; `self.pattern` marks the slots in which a message
+        is due, None for all.
         """
-        if self.slots is None:
+        if self.slots is None:  # nobody knows when a message is due
             return self.time[:0]
         if not self.arrived.any():
             return self.time
@@ -199,7 +208,8 @@ class Arrivals:
         """Return whether the share that arrived contradicts the stated share p, by a test at `level`.
 
         The shares must also differ by more than a hundredth (LEAST_SHARE). Arrivals in bursts count as fewer
-        independent ones: N (1 - a) / (1 + a), with the correlation a of each arrival with the next.
+        independent ones: N (1 - a) / (1 + a), with the correlation a of each arrival with the next. `self.due_slots`
+        says for each slot in which a message was due whether one came; `self.share` is their share.
         """
         p = self.stated_share  # probability of arrival by the model
         if p is None or self.due_slots is None or not 0 < p < 1:
@@ -241,6 +251,9 @@ def list_arrivals(network: Network, times: np.ndarray, received: Mapping[str, np
 
     The diagnosis compares arrivals with what the network declares: losses, periods of sending. Rows of one time count
     as one, since each node's message may have a row of its own.
+
+    `declared`: what the network says of the node's messages: their period in rows, whether they may be lost, and the
+    probability with which each number arrives.
 
     Args:
         network: the network.
@@ -308,7 +321,8 @@ def _read_declared_sending(receiver: Any) -> _DeclaredSending:
     """Return what the network says of a node's messages: their period, if they may be lost, and which shares arrive.
 
     The period is in steps, None if none is declared. There is a share for each received number, None if they are not
-    constant.
+    constant. `receiver`: a `Node` behind a channel, or a relay, which says only whether it is `complete`, that is loses
+    nothing.
     """
     if not isinstance(receiver, Node):
         return _DeclaredSending(period=None, may_be_lost=not receiver.complete, shares=None)
@@ -323,7 +337,10 @@ def _read_declared_sending(receiver: Any) -> _DeclaredSending:
 def _find_arrival_probabilities(receiver: Node) -> Float[np.ndarray, " received"] | None:
     """Return the probability of arrival of each received number, or None if it is not constant.
 
-    It is also None if the link loses nothing, or if the sender decides when to send.
+    It is also None if the link loses nothing, or if the sender decides when to send. `erases` says whether the channel
+    loses components, `remembers` whether losses depend on earlier ones. An outcome has a probability and the mask
+    `arrived` of components. `receiver`: the node, with its channel, and its trigger if its sender does not send in each
+    step.
     """
     sends_always = receiver.trigger is None or isinstance(receiver.trigger, Periodic)
     if not sends_always or isinstance(receiver.channel, OverTime):

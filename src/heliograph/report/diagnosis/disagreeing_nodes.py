@@ -40,13 +40,14 @@ def find_constant_error_between_nodes(
     nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node) and _can_be_joined(node)}
     names = [f"{name}: {output}" for name, node in nodes.items() for output in node.received_names]
     has_centre = any(isinstance(fusion, AbstractFilter) for fusion in network.fused.values())
-    if len(nodes) < 2 or len(names) > MOST or has_centre:
+    if len(nodes) < 2 or len(names) > MOST or has_centre:  # MOST: outputs of which each is tried
         return None
     # Filter of all nodes' measurements (time, all outputs).
     joint = _make_joint_filter(network, nodes)
     if joint is None:
         return None
     z = np.concatenate([record.measurements[name] for name in nodes], axis=1)
+    # `size`: the error over the usual deviation of the output's innovations; below LEAST (0.2) it is not worth a word.
     found = find_constant_error(names, joint, z, inputs)
     if found is None or found.size < LEAST:
         return None
@@ -57,7 +58,11 @@ def find_constant_error_between_nodes(
 
 
 def _make_joint_filter(network: Network, nodes: dict[str, Node]) -> AbstractFilter | None:
-    """Return a filter of what all these nodes receive, or None if no such filter can be made for their links."""
+    """Return a filter of what all these nodes receive, or None if no such filter can be made for their links.
+
+    The sensors are stacked, and the links joined into one channel behind them, which delivers all numbers at once. The
+    filter is linear if plant and sensors are, else a cubature filter.
+    """
     # Lost numbers are NaN in the data, so the links only need to say how numbers that arrive are changed.
     links = [node.channel.condition_on_arrival() for node in nodes.values() if not isinstance(node.channel, OverTime)]
     sensor, channel = join_links({name: node.sensor for name, node in nodes.items()}, links)
@@ -73,7 +78,8 @@ def _can_be_joined(node: Node) -> bool:
     """Return whether a filter of several nodes can take this one in.
 
     Its sensor and link must not change over time. Messages must come whenever they are due, and without an encoder. A
-    filter of the node must claim a covariance, and no such filter may weigh values by how likely they are.
+    filter of the node must claim a covariance, and no such filter may weigh values by how likely they are. A `Periodic`
+    trigger sends at fixed steps.
     """
     is_constant = not isinstance(node.sensor, OverTime) and not isinstance(node.channel, OverTime)
     sends_when_due = node.trigger is None or isinstance(node.trigger, Periodic)

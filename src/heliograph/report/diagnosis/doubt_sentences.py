@@ -17,7 +17,7 @@ def _format_outputs_and_sizes(outputs: Sequence[str], sizes: Sequence[float]) ->
 def say_overconfident(name: str, outputs: Sequence[str], sizes: Sequence[float]) -> str:
     """Return the sentence on a filter whose NIS (squared innovations over their variance) is above its interval.
 
-    `sizes` says for each of `outputs` how many times larger the squares are than claimed.
+    `sizes` says for each of `outputs` how many times larger the squares are than claimed. `name`: of the filter.
     """
     of, times = _format_outputs_and_sizes(outputs, sizes)
     return (
@@ -29,7 +29,8 @@ def say_overconfident(name: str, outputs: Sequence[str], sizes: Sequence[float])
 def say_innovation_is_impossible(name: str, found: ImpossibleInnovation, probability: float) -> str:
     """Return the sentence on one innovation that is larger than any law with the claimed variance makes plausible.
 
-    If the claim holds, any of the innovations is as large with at most this `probability`.
+    If the claim holds, any of the innovations is as large with at most this `probability`. `name`: of the filter.
+    `found`: its row and its size in claimed deviations.
     """
     return (
         f"{name} is too sure, or the measurement is wrong: its innovation in row {found.row} is {found.deviations:.3g} "
@@ -40,7 +41,7 @@ def say_innovation_is_impossible(name: str, found: ImpossibleInnovation, probabi
 def say_innovations_are_correlated(name: str, test: MemoryTest) -> str:
     """Return the sentence on innovations that are correlated in time; `test` has their correlation at each lag.
 
-    `test.predictable` is the share of their variance that earlier innovations predict.
+    `test.predictable` is the share of their variance that earlier innovations predict. `name`: of the filter.
     """
     return (
         f"{name} could know more: its innovations are correlated with those before ({test.correlation[0]:.2f} with the "
@@ -55,7 +56,7 @@ def say_constant_error(name: str, error: ConstantError) -> str:
     """Return the sentence on an output's constant error, which explains all doubts of a filter or most of them.
 
     If it does not explain all (`nothing_else`), `error.explained` is the share of the excess of the filter's squared
-    innovations that it explains.
+    innovations that it explains. `name`: of the filter. `error` as a text has the output, the error and its interval.
     """
     if not error.nothing_else:
         share = f"{min(error.explained, 0.99):.0%} of what its squared innovations are too large by"
@@ -67,7 +68,10 @@ def say_constant_error(name: str, error: ConstantError) -> str:
 
 
 def say_node_differs(error: ConstantError) -> str:
-    """Return the sentence on the output that differs from what the other nodes say by a constant."""
+    """Return the sentence on the output that differs from what the other nodes say by a constant.
+
+    `error` as a text has the output, the error and its interval.
+    """
     return (
         f"nodes disagree: a constant error of {error}, explains it. By itself a node takes it for the state; "
         "hg.model.with_bias makes it a state of its own"
@@ -75,7 +79,10 @@ def say_node_differs(error: ConstantError) -> str:
 
 
 def say_underconfident(name: str, outputs: Sequence[str], sizes: Sequence[float]) -> str:
-    """Return the sentence on a NIS below its interval, as it is also if a filter follows its sensor's slow error."""
+    """Return the sentence on a NIS below its interval, as it is also if a filter follows its sensor's slow error.
+
+    `name`: of the filter. `sizes`: for each of `outputs` the mean square of its innovations over what is claimed.
+    """
     of, times = _format_outputs_and_sizes(outputs, sizes)
     return (
         f"{name} expects more{of} than comes: the mean square of its innovations is {times} times what it claims. "
@@ -101,7 +108,9 @@ def say_how_to_refuse_repeats(held: StuckValue, refused: bool) -> str:
 def say_declared_variances_are_off(judgements: Sequence[DeclaredJudgement], unit: str) -> list[str]:
     """Return the sentences on noise variances that messages report; with several links, their outputs are named.
 
-    `judgements` compare the reported variances with the innovations, one for each link. `unit`: of the plant's time.
+    A link may report the variance of its noise with each message. `judgements`: for each such link, the comparison of
+    these variances with the innovations; its `sentences` say what is wrong with them, none where nothing is, and
+    `outputs` has the names of what the link carries. `unit`: of the plant's time, for the memory of a bias.
     """
     several = len(judgements) > 1
     return [

@@ -18,6 +18,7 @@ def compute_expected_squares(
     It is the innovation's variance given this recording, divided by its variance over all runs. That is 1 for most
     filters. With random gains of the links it is not, since the state of this run differs from its mean over all runs.
     Then `given_record` returns another filter, whose covariances are given the data; else it returns the filter itself.
+    `data`: what the filter received (steps, m). The result (steps, m) is 1 too where no variance is claimed.
     """
     conditioned = filter.given_record()
     if conditioned is filter:
@@ -37,7 +38,8 @@ def compute_ratio_of_squares(
 
     Args:
         squares: squared innovations in units of their claim, NaN where there is none.
-        expected: expected means of the squares, as `compute_expected_squares` returns them; 1 for most filters.
+        expected: what the model expects of each square in this recording, over its variance in all runs; 1 for most
+            filters.
     """
     is_known = ~np.isnan(squares) & ~np.isnan(expected)
     if not is_known.any() or not expected[is_known].any():
@@ -58,7 +60,8 @@ def scale_size_to_expected(
     Args:
         test: test of the innovations' size and memory.
         white: innovations in units of their claimed deviations (steps, m), NaN where none came.
-        expected: expected mean squares, as `compute_expected_squares` returns them. If all are 1, `test` is returned.
+        expected: what the model expects of each square (steps, m) in this recording, over its variance in all runs. If
+            all are 1, `test` is returned.
     """
     if np.all(expected == 1):
         return test

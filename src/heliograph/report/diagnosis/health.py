@@ -106,7 +106,11 @@ class Health:
     time_unit: str = ""  # that times are in another unit than the plant's, which explains what is doubtful
 
     def warnings(self) -> list[str]:
-        """Return one line for each reason to doubt the network, the weightiest first."""
+        """Return one line for each reason to doubt the network, the weightiest first.
+
+        `silences` has by node how long it was silent past its timeout, `doubtful_estimates` lines on estimates that
+        cannot be right, and `time_unit` the sentence on times in a wrong unit, "" if there is none.
+        """
         lines = [*self.record.failures(), *self.describe_stuck_outputs().values(), *self.doubtful_estimates]
         lines += [f"{node}: {found.describe()}" for node, found in self.silences.items()]
         lines += self._describe_losses()
@@ -117,7 +121,11 @@ class Health:
         return lines + [line for filter in self.list_doubted_filters() for line in self._describe_doubts(filter)]
 
     def _describe_losses(self) -> Iterator[str]:
-        """Yield a line for each link that never delivers, or that loses more or less than the network says."""
+        """Yield a line for each link that never delivers, or that loses more or less than the network says.
+
+        A link is one received number of a node. `share` is the share of due messages that arrived; `contradicts` tests
+        it against the stated share, at a level that all links share.
+        """
         for link in self.links:
             name = f"{link.node}: {link.component}"
             if not link.arrived.any():
@@ -154,7 +162,8 @@ class Health:
     def list_doubted_filters(self) -> list[FilterHealth]:
         """Return the filters that the network relies on and whose claims the recording contradicts.
 
-        Filters that use a stuck output are left out: their innovations show only that.
+        Filters that use a stuck output are left out: their innovations show only that. `describe_stuck_outputs` has
+        such outputs by (node, output); `_describe_doubts` yields a sentence for each doubt.
         """
         stuck = {node for node, _ in self.describe_stuck_outputs()}
 
@@ -175,7 +184,8 @@ class Health:
         These are: outputs left out, a constant error, variances reported with messages (`declared`), an impossible
         innovation in a short recording, sizes other than claimed, and correlation in time (memory). A doubt that
         explains later ones ends the list. `health` holds the innovations of one filter of a node and their tests:
-        `test` is that of size and whiteness, None with too few rows.
+        `test` is that of size and whiteness, None with too few rows. `FALSE`: probability of a false warning by this
+        test, over all filters together.
         """
         yield from self._describe_left_out(health)
         name = f"{health.node}/{health.filter}"
@@ -210,7 +220,7 @@ class Health:
 
         Each output is judged by itself, since a mean over outputs hides the one that is wrong; all are judged together
         where none is wrong by itself. `health`: the filter's innovations. `test`: of these over all outputs, with their
-        mean square `power` and its standard error.
+        mean square `power` and its standard error. Enough are more than LAGS (10) innovations.
         """
         # `level`: probability of a false alarm that one test may have.
         name = f"{health.node}/{health.filter}"
@@ -240,7 +250,9 @@ class Health:
         """Return whether the innovations of a filter, less the effect of a constant error, are as the filter claims.
 
         Then their squares are as large as claimed, and they are not correlated in time. `error.white` are these
-        innovations over their deviations, (time, m), and `error.squares` the squares, NaN where none came.
+        innovations over their deviations, (time, m), and `error.squares` the squares, NaN where none came. `judge_size`
+        returns 0 if a mean square, with its standard error, differs from 1 only by chance at `level`. `health`: the
+        filter.
         """
         level = self._level_of_one_test() / error.squares.shape[1]
         for squares_of_output in error.squares.T:
@@ -253,7 +265,9 @@ class Health:
     def _has_memory(self, health: FilterHealth, test: MemoryTest) -> bool:
         """Return whether innovations predict later ones (by the last one or by several) more than by chance.
 
-        Among N independent numbers, each lag seems to predict 1 / N of the variance.
+        Among N independent numbers, each lag seems to predict 1 / N of the variance. LEAST_SHARE is 1 % of the
+        variance: less is not worth a warning. `health`: the filter with its innovations. `test`: their correlations at
+        each lag, with p-values of the first lag and of all, and the share of their variance that is `predictable`.
         """
         # Gains are optimal for the mean over all possible runs. `expected`: the mean square innovation of this run's
         # gains and losses over that mean. Beyond a factor TYPICAL innovations of a right model are correlated as well.
@@ -266,7 +280,8 @@ class Health:
     def _describe_left_out(self, health: FilterHealth) -> Iterator[str]:
         """Yield sentences on outputs of which a filter that weighs outliers down left out many values.
 
-        `heliograph.run` warns in the same words.
+        `heliograph.run` warns in the same words. `output.weighs` says whether the filter weighs outliers down;
+        `summary.describe_left_out` yields the sentences.
         """
         for output in self.outputs:
             if output.weighs and (output.node, output.filter) == (health.node, health.filter):

@@ -40,7 +40,7 @@ def compute_innovation_medians(
     channel = first(receiver.channel).condition_on_arrival()
     if noise.is_symmetric or channel.remembers or channel.past or channel.outputs != receiver.received:
         return np.zeros(receiver.received)
-    # M (v - E v) of drawn noises, (draws, received), with the mean gain M.
+    # M (v - E v) of DRAWS noises, (draws, received), with the mean gain M.
     with jax.enable_x64(True):
         noises = np.asarray(jax.vmap(noise.sample)(jax.random.split(jax.random.key(0), DRAWS)))
         # M is a block of the mean of the map from (y, 1) to (z, 1): the rows of z and the columns of y.

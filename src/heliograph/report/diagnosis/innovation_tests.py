@@ -27,7 +27,7 @@ def judge_size(size: float, error: float, numbers: int, level: float) -> int:
     """
     if not (size > 0 and error > 0):
         return 0
-    relative_error = max(error / size, np.sqrt(2 / numbers) if numbers else 0.0)
+    relative_error = max(error / size, np.sqrt(2 / numbers) if numbers else 0.0)  # of size: the error of its logarithm
     half_width = max(-ndtri(level / 2) * relative_error, np.log(LEAST_SIZE))
     return int(np.sign(np.log(size))) if abs(np.log(size)) > half_width else 0
 
@@ -45,7 +45,7 @@ def find_impossible_innovation(
     """Return the largest innovation if no law with the claimed variance gives one as large so often, else None.
 
     By Chebyshev's inequality P(|e| >= t) <= 1 / t^2 for every law of e with a mean square of at most 1, so that neither
-    Gaussian noise nor a number of rows is needed.
+    Gaussian noise nor a number of rows is needed. The result has its row, counted from 1, and its size in deviations.
 
     Args:
         white: innovations in units of their claimed covariance, NaN where nothing arrived; None for a filter without a
@@ -74,7 +74,7 @@ def find_memory(white: Float[np.ndarray, "steps m"]) -> MemoryTest | None:
     """Return the test whether innovations are correlated from message to message; None if there are too few for it.
 
     It needs ten rows for each lag, more than LAGS numbers, and one that is not 0. Rows in which nothing came are left
-    out. `white`: innovations in units of their claimed covariance.
+    out. `white`: innovations in units of their claimed covariance. LAGS is 10: the most lags that are tested.
     """
     came = white[~np.isnan(white).all(axis=1)]
     lags = min(LAGS, len(came) // 10)

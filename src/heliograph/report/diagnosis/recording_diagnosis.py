@@ -91,7 +91,9 @@ def examine(
 def _explain_doubts(network: Network, health: Health, inputs: np.ndarray) -> Health:
     """Return the diagnosis with what may explain doubts: a constant error of an output or node, another unit of time.
 
-    A stuck output makes nodes disagree, too; then no constant error between nodes is looked for.
+    A stuck output makes nodes disagree, too; then no constant error between nodes is looked for. `list_doubted_filters`
+    are the trusted ones whose claims the recording contradicts; keys of the errors are (node, filter). FALSE:
+    probability with which a right network may be doubted.
     """
     errors = {
         (filter.node, filter.filter): _find_constant_error(network, health, filter, inputs)
@@ -113,6 +115,8 @@ def _examine_filter(
     is said to be) holds they have variance 1 and no correlation over time, which `test` examines. Both are None for a
     filter that claims no covariance, or receives nothing. `expected`: mean square of `white` that the model expects in
     this recording, which random gains may move from 1. `declared`: tests of noise variances reported with messages.
+    `listener`: the filter, its names, and the measurements that it received. `record`: the run. `inputs` (time,
+    inputs).
     """
     node = listener.node
     name = listener.name
@@ -123,6 +127,7 @@ def _examine_filter(
     if filter.claim != "none" and filter.received:
         # Whiten the innovations, test their correlation over time (of a filter that weighs outliers down, about their
         # mean), and compare their size with the expected one.
+        # `scores` are the innovations L^-1 (z - E z); the log densities before them are not needed.
         _, scores = score_innovations(filter, z, inputs)
         white = np.asarray(scores)
         test = find_memory(subtract_mean(white) if weighs(filter) else white)
@@ -144,7 +149,11 @@ def _examine_filter(
 
 
 def _doubt_time_unit(network: Network, health: Health, inputs: np.ndarray) -> str:
-    """Return the sentence that times seem to be in another unit, judged by the first doubted filter, or ""."""
+    """Return the sentence that times seem to be in another unit, judged by the first doubted filter, or "".
+
+    Filters with enough rows for a test count. `_find_judged_filter` returns the filter itself, its name and node, and
+    the measurements that it received.
+    """
     tested = [judged for judged in health.list_doubted_filters() if judged.test is not None]
     if not tested:
         return ""
@@ -162,7 +171,12 @@ def _find_judged_filter(network: Network, record: Record, judged: FilterHealth) 
 def _find_constant_error(
     network: Network, health: Health, judged: FilterHealth, inputs: np.ndarray
 ) -> ConstantError | None:
-    """Return the constant error of an output that explains all or MOST of a filter's doubts, or None."""
+    """Return the constant error of an output that explains all or MOST of a filter's doubts, or None.
+
+    `explained` is the share of the excess of squared innovations that the error explains; `nothing_else` says that the
+    innovations without its effect are as claimed. None too without a test of the filter's innovations. `judged`: the
+    filter whose innovations are doubted; `health`: the diagnosis so far.
+    """
     if judged.test is None:
         return None
     tested = _find_judged_filter(network, health.record, judged)

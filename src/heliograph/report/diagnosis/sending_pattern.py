@@ -24,7 +24,8 @@ def find_pattern(arrived: Bool[np.ndarray, " time"]) -> SendingPattern | None:
     """Return the pattern of rows in which a message is due, or None if random losses could have left it.
 
     Messages are due in `due` of each `length` rows, and all other rows are empty. The due rows may have a pattern
-    themselves (`finer`, a mask over len(finer) due rows), and so on: the result is the finest one.
+    themselves (`finer`, a mask over len(finer) due rows), and so on: the result is the finest one. `rows` of the result
+    marks the due rows of the recording.
     """
     rows, due, length = np.ones(len(arrived), dtype=bool), 1, 1  # at first each row is due
     finer = _find_least_probable_rows(arrived[rows])
@@ -34,7 +35,7 @@ def find_pattern(arrived: Bool[np.ndarray, " time"]) -> SendingPattern | None:
         repetitions = len(finer) // np.gcd(due, len(finer))
         due = int(finer.sum()) * due * repetitions // len(finer)
         length = length * repetitions
-        rows[rows] = np.resize(finer, int(rows.sum()))
+        rows[rows] = np.resize(finer, int(rows.sum()))  # the finer pattern, repeated over the rows that were due so far
         finer = _find_least_probable_rows(arrived[rows])
     return None if length == 1 else SendingPattern(due, length, rows)
 
@@ -45,7 +46,9 @@ def _find_least_probable_rows(arrived: Bool[np.ndarray, " rows"]) -> Bool[np.nda
     A sender may be due in some rows only, as every third one; then the other rows are no losses. A pattern is a mask of
     the due rows (length,), which repeats. Of each length the smallest pattern is tried: rows in which a message came.
     Probabilities are bounds, times the number of patterns that might have been found instead; `least` is the logarithm
-    of the least one so far, from CHANCE on. `arrived`: whether a message came in each row (rows,).
+    of the least one so far, from CHANCE on. `arrived`: whether a message came in each row (rows,). `_bound_log_chance`
+    bounds the log probability that losses in bursts let nothing arrive outside a pattern. CHANCE is 1e-4; up to SHORT
+    (32) rows bursts are looked at in each pattern. Patterns of more than LONGEST (256) rows are not tried.
     """
     # Losses at random, in bursts: a law fitted to the intervals between arrivals.
     arrivals = np.flatnonzero(arrived)
@@ -101,7 +104,8 @@ class BurstLossLaw(NamedTuple):
         probability is at most stay(first) / z^count for any z > 0; the least of several z counts. With due(r) 0 or 1,
         stay(r) = z (follows due(r + 1) stay(r + 1) + (1 - follows) later(r)), where `follows` is the probability of an
         arrival in the next row; later(r) = ends due(r + 2) stay(r + 2) + (1 - ends) later(r + 1), where `ends` is the
-        probability that a burst of losses ends. Both are 1 after the last row.
+        probability that a burst of losses ends. Both are 1 after the last row. `_log_mean_of_powers` computes
+        log(stay(first) / z^count) for one z.
         """
         # z = share^-exponent with the share of due rows, which is at least 1 / n, so that z is finite.
         share = max(float(np.mean(due)), 1 / len(due))

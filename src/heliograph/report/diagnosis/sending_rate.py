@@ -47,8 +47,8 @@ def find_rate(arrived: Bool[np.ndarray, " time"]) -> SendingRate | None:
 
     A sender that is due each T rows, where T is no integer, comes in the rows r with frac(r / T - phase) < 1 / T, with
     frac the fractional part. All other rows are empty. If T is hardly above 1, empty rows are rare, and are found by
-    their own rate: one each 1 / (1 - 1 / T) rows, none missing. `slots` in the result: number of each arrival among
-    the messages due.
+    their own rate: one each 1 / (1 - 1 / T) rows, none missing. `slots` in the result: number of each arrival among the
+    messages due. `_find_slowest_rate` does this for periods that leave many rows empty. `period` is in rows.
     """
     rate = _find_slowest_rate(arrived)
     if rate is not None:
@@ -66,7 +66,9 @@ def _find_slowest_rate(arrived: Bool[np.ndarray, " time"]) -> SendingRate | None
     A sender with its own clock sends at a rate below that of the rows, so that some rows are empty without a loss. It
     may begin late and fall silent: the rows from its first arrival to its last decide, up to ENOUGH. Then the phases of
     arrivals (row times frequency, less whole periods) lie in a narrow interval, and rows whose phase is in it are due.
-    A rate is accepted if losses in bursts would leave all other rows empty with a probability below CHANCE.
+    A rate is accepted if losses in bursts would leave all other rows empty with a probability below CHANCE. `slots` of
+    the result numbers the periods of the arrivals from 0. FEWEST is 8 arrivals; N rows distinguish some N values of
+    each of a rate's PARAMETERS (5).
     """
     rows = np.flatnonzero(arrived)
     span = 1 + int(np.ptp(rows)) if len(rows) else 0  # rows from the first arrival to the last
@@ -82,6 +84,7 @@ def _find_slowest_rate(arrived: Bool[np.ndarray, " time"]) -> SendingRate | None
     # Many rates are possible, and any would have been taken, so the chance of one is multiplied by their number.
     log_number_of_rates = PARAMETERS * np.log(len(arrived))
     for frequency in _find_likely_frequencies(arrived):
+        # The frequency nearby, and the interval of phases of this width, that hold all arrivals; None if none does.
         due_rows = _fit_rate(frequency, rows)
         if due_rows is None:
             continue
@@ -97,7 +100,8 @@ def _find_slowest_rate(arrived: Bool[np.ndarray, " time"]) -> SendingRate | None
 def _fit_rate(frequency: float, rows: Int[np.ndarray, " arrivals"]) -> _PeriodicRows | None:
     """Return the due rows of a sender near a frequency (in periods per row), or None if the arrivals' rows do not fit.
 
-    Each arrival has to be in a period of its own.
+    Each arrival has to be in a period of its own. `width` of the result is the length of the interval of phases, in
+    periods; OFF (0.25) is how much wider it may be at the given frequency than at the best one near it.
     """
     # Due rows have phases in an interval of length 1 / T = frequency: about the rest of the circle is empty.
     middle, gap = _find_largest_gap(frequency, rows)
@@ -145,7 +149,7 @@ def _fit_periodic_rows(frequency: float, rows: Int[np.ndarray, " arrivals"], mid
 
     The phase of the arrival in row r is f r - k, with k the number of its period at the given frequency, which is kept.
     Then the width max(phase) - min(phase) is a convex function of f. Its slope is the distance between the rows of the
-    largest and the least phase, so bisection finds the minimum.
+    largest and the least phase, so bisection finds the minimum. STEPS, 18, halve the interval often enough.
 
     Args:
         frequency: an approximate frequency, in periods per row.

@@ -49,6 +49,9 @@ def compute_filter_errors(record: Record) -> list[FilterErrors]:
     They are the RMSE of each state, and the NEES e' P^-1 e divided by the number of states whose truth is known, with
     e the error and P the claimed covariance: 1 where the claim holds. Both come with standard errors. `record` has true
     states and estimates of a run, by node and filter; Network.FUSED stands for the fusion centre.
+
+    `claim` is the weakest claim that the filter had in any row; `weakest` chooses it. `average_correlated` returns a
+    mean over rows that are correlated over time, and its standard error.
     """
     if record.truth is None:
         return []
@@ -80,7 +83,7 @@ def _estimate_rmse_errors(record: Record, node: str, name: str, rmse: Mapping[st
     """Return the standard error of each state's RMSE, NaN for an RMSE of 0.
 
     With the mean square M = RMSE^2, to first order it is the standard error of M divided by 2 RMSE. `rmse` holds by
-    state the RMSE of the filter `name` at `node`.
+    state the RMSE of the filter `name` at `node`. `record.errors` are the estimates' errors (rows, n).
     """
     truth = np.asarray(record.truth)
     squares = np.where(np.isnan(truth), np.nan, record.errors(node, name)) ** 2
@@ -148,7 +151,8 @@ def yield_filters_with_measurements(network: Network, record: Record) -> Iterato
     """Yield every filter with its measurements: those of the nodes, then central ones.
 
     A filter is trusted if the network relies on it. It blames (its weights decide which outputs are bad) if it weighs
-    outputs and is trusted, or if it weighs outputs and no trusted filter of the node does.
+    outputs and is trusted, or if it weighs outputs and no trusted filter of the node does. A central filter receives
+    the numbers of all nodes, one node after the other; it is trusted, and blames.
     """
     received = record.measurements
     relied_on = _list_relied_on_filters(network)
@@ -210,7 +214,8 @@ def judge_outputs_of_filter(
 
     Args:
         network: the network.
-        listener: the filter with its names and the measurements (time, outputs) that it received.
+        listener: the filter with its names, the measurements (time, outputs) that it received, and `blames`, whether
+            its weights say which output is to blame.
         record: the run of the network, which holds the innovations of filters that weigh outliers down.
         inputs: inputs of the plant (time, inputs).
     """
@@ -274,7 +279,8 @@ def judge_outputs(
         medians: medians (m,) that the innovations have anyway, where the noise's law is not symmetric; a bias is
             measured from these.
         blames: whether the filter weighs outliers down, so that low weights tell which output has them.
-        expected: expected squares of the innovations (time, m), as `compute_expected_squares` returns them.
+        expected: what the model expects of each squared innovation (time, m) in this recording, over its variance in
+            all runs; 1 for most filters.
         laws: law of each output's noise, by which equal values are judged; None where they are not known.
     """
     # Subtract from each bias, and from both ends of its interval, the median that the law of the noise explains.
@@ -340,7 +346,11 @@ class RecentInnovations:
 
 
 def summarise_weighed_outputs(network: Network, record: Record) -> list[OutputHealth]:
-    """Return what the innovations of all weighing filters say about each output of a recording."""
+    """Return what the innovations of all weighing filters say about each output of a recording.
+
+    `record.weighed` has the innovations, variances and weights by node and filter. The judgement of an output has its
+    bias, the share of its values that were weighted down, and whether it is to blame.
+    """
     # Inputs are not needed (an empty array), since the record holds these filters' innovations.
     outputs: list[OutputHealth] = []
     no_inputs = np.zeros(0)
@@ -355,7 +365,7 @@ def summarise_output(health: OutputHealth) -> dict[str, Json]:
 
     They are of its innovations: mean (bias, with interval), mean square, and mean square over the claimed variance
     (size). If its filter weighs outputs: mean weight, and the share that was weighted down. held: a run of equal
-    readings longer than noise allows.
+    readings longer than noise allows. `health`: the output with its judgement.
     """
     judged, summary = health.judged, health.judged.summary
     values: dict[str, float] = {"bias": summary.bias, "bias_low": summary.bias_low, "bias_high": summary.bias_high,
@@ -373,7 +383,10 @@ def summarise_output(health: OutputHealth) -> dict[str, Json]:
 
 
 def make_output_row(health: OutputHealth) -> dict[str, Json]:
-    """Return one output's names, its numbers, and a text on them."""
+    """Return one output's names, its numbers, and a text on them.
+
+    `health`: the output of a filter with its judgement; `summarise_output` has the numbers.
+    """
     judged = health.judged
     words = str(judged.summary) + ("; to blame" if judged.to_blame else "")
     named: dict[str, Json] = {"node": health.node, "filter": health.filter, "output": judged.output, "words": words}

@@ -101,7 +101,9 @@ def find_stuck_value(
     somewhere in N readings with probability at most N p^(n - 1). The noise gives one bound
     (`_bound_repetition_probability`). But a link may repeat a value by itself, as one that is off gives 0 each time. So
     p is at least two shares among the readings outside of the run: the share of the run's value, and the share of
-    readings that equal the one before. Where all values are equal, nothing is outside of the run, and p = 1/2.
+    readings that equal the one before. Where all values are equal, nothing is outside of the run, and p = 1/2. SHORTEST
+    is 3 readings, SELDOM 1e-4 runs expected. `stuck` of the result: length of run from which a node may refuse the
+    value.
 
     Args:
         values: what was received (time,), NaN where nothing arrived.

@@ -24,7 +24,7 @@ def describe_wrong_time_unit(
 
     A common error is a recording in milliseconds for a plant in seconds. The filter runs on the recording as it is, and
     with dt in other units. The sentence is returned if the innovations agree with their claimed covariances in another
-    unit alone, and the log likelihood is clearly higher there.
+    unit alone, and the log likelihood is clearly higher there. "Clearly" is by CLEAR = log 10^6.
 
     Args:
         name: name of the filter.
@@ -39,6 +39,7 @@ def describe_wrong_time_unit(
     as_stated = filter.run(measurements, inputs)
     if _is_as_claimed(as_stated.innovations, as_stated.innovation_covariances):
         return ""
+    # A thousandth and a thousand times dt, with words for each.
     for factor, words in UNITS.items():
         scaled = np.array(inputs, dtype=float)
         scaled[:, column] *= factor

@@ -119,7 +119,8 @@ def judge_forecasts_of_filters(found: "heliograph.forecasting.Backtest") -> list
 
     An interval claims to hold a share (SHARES) of what comes. It is a miss if the share that it held differs from the
     claim by more than FAR (3) of its standard errors, and the binomial probability of such a difference (`chance`) is
-    also below that of 3 standard errors under a normal law.
+    also below that of 3 standard errors under a normal law. A filter's `compared` counts its intervals in which
+    anything came. `found`: the scores of forecasts, by filter, number and horizon.
     """
     verdicts = []
     for name in dict.fromkeys(f"{score.node}/{score.filter}" for score in found.scores):
@@ -145,6 +146,8 @@ def _draw_coverage(found: "heliograph.forecasting.Backtest") -> Figure:
 
     There is a panel for each forecast state or output (the first PANELS), and a line for each filter. The dashed line
     is the claimed 80 %. Bars are 2 standard errors. `found` holds the scores of forecasts on recorded data.
+    `s.coverage` has the shares that came within the intervals of 50, 80 and 95 %, with standard errors; DRAWN picks 80
+    %.
     """
     numbers = list(dict.fromkeys((s.node, s.part, s.name) for s in found.scores))[:PANELS]
     filters = list(dict.fromkeys(s.filter for s in found.scores))
@@ -180,6 +183,9 @@ def make_backtest_page(
     found: "heliograph.forecasting.Backtest", network: str, drawings: Mapping[str, bytes], refit: int = 0
 ) -> Page:
     """Return the page of a backtest: forecasts from past rows, scored by what came later.
+
+    A verdict says of one filter how many of its intervals were compared, and which missed what they claim. DRAWN is the
+    index of the interval of 80 % in SHARES; PANELS numbers are drawn, LISTED filters get a sentence.
 
     Args:
         found: the scores of each forecast number, by node, filter and horizon.
@@ -227,7 +233,11 @@ def _make_title(verdicts: Sequence[FilterVerdict]) -> str:
 
 
 def _make_score_table(found: "heliograph.forecasting.Backtest") -> Table:
-    """Return all scores, a row for each forecast and horizon, with their standard errors."""
+    """Return all scores, a row for each forecast and horizon, with their standard errors.
+
+    `found`: the scores; a score has node, filter, part (state or output), name, horizon, and means with standard
+    errors.
+    """
     # The RMSE is a root, so its standard error is that of the mean square divided by twice the root.
     rows = [
         [visible(f"{s.node}/{s.filter} {s.part} {s.name}"), str(s.horizon), f"{s.compared:,}",
@@ -242,7 +252,11 @@ def _make_score_table(found: "heliograph.forecasting.Backtest") -> Table:
 
 
 def _list_all_numbers(found: "heliograph.forecasting.Backtest") -> dict[str, Json]:
-    """Return all numbers of the backtest for its summary."""
+    """Return all numbers of the backtest for its summary.
+
+    `found.scores` has a score for each forecast number, filter and horizon, whose `row()` is {name: number}. JSON has
+    no NaN: it becomes None.
+    """
 
     def convert_to_json(value: object) -> Json:
         """Return texts and integers as they are, finite numbers as floats, and None for everything else."""

@@ -49,7 +49,12 @@ class DesignResults:
 
 
 def make_design_results(results: DesignResults) -> ResultsContent:
-    """Return the content of the results folder of a design: figures, page, summary and the two networks' sources."""
+    """Return the content of the results folder of a design: figures, page, summary and the two networks' sources.
+
+    `results` has the design, the powers before it, the least error by total power (`front`), what changes are worth,
+    and the source of both networks. `page` and `write_data` are called later, with the figures as SVG and with the
+    folder.
+    """
     return ResultsContent(
         figures=draw_design_figures(results),
         page=partial(make_design_page, results),
@@ -59,7 +64,10 @@ def make_design_results(results: DesignResults) -> ResultsContent:
 
 
 def write_networks(results: DesignResults, folder: Path) -> None:
-    """Write the original network, and in the same folder the designed one, which reads it."""
+    """Write the original network, and in the same folder the designed one, which reads it.
+
+    SOURCE and DESIGNED are their file names.
+    """
     (folder / SOURCE).write_text(results.source, encoding="utf-8")
     (folder / DESIGNED).write_text(results.written, encoding="utf-8")
 
@@ -71,7 +79,12 @@ def compute_mean_powers(design: PowerDesign) -> dict[str, float]:
 
 
 def make_design_summary(results: DesignResults) -> dict[str, Json]:
-    """Return all numbers of the report of a design by name, as summary.json holds them."""
+    """Return all numbers of the report of a design by name, as summary.json holds them.
+
+    `certificate` is the proof of how good the design is: a lower bound of the error, and the gap to it. `front` is the
+    least error by total power; `changes` are what one more transmitter, relay or place saves; `map` has the error over
+    places for one more, or is None.
+    """
     design, certificate = results.design, results.design.certificate
     # JSON has no arrays: all numbers become lists.
     best = None if results.map is None else dict(zip(("x", "y", "error"), results.map.best, strict=True))
@@ -109,7 +122,8 @@ def draw_design_figures(results: DesignResults) -> dict[str, Figure]:
 def draw_pareto_front(front: ErrorsOverPower, marks: Mapping[str, tuple[float, float]]) -> Figure:
     """Plot error over total power: the least error found, the proven lower bound, and named points.
 
-    `marks`: {name: (power, error)} of points to mark, at most three.
+    `marks`: {name: (power, error)} of points to mark, at most three. `front`: total powers, with errors and lower
+    bounds.
     """
     figure = Figure(figsize=(WIDTH, 3.4), layout="constrained")
     axes = figure.subplots()
@@ -153,7 +167,10 @@ def draw_powers(before: Mapping[str, float], after: Mapping[str, float]) -> Figu
 
 @matplotlib.rc_context(STYLE)
 def draw_error_map(sites: ErrorsOverSites) -> Figure:
-    """Plot the error over places, darker where it is smaller, with the best place."""
+    """Plot the error over places, darker where it is smaller, with the best place.
+
+    `sites`: places x and y, the errors there, and the best place with its error.
+    """
     figure = Figure(figsize=(WIDTH, 4.6), layout="constrained")
     axes = figure.subplots()
     picture = axes.contourf(sites.x, sites.y, sites.errors, levels=14, cmap="cividis")
@@ -166,7 +183,11 @@ def draw_error_map(sites: ErrorsOverSites) -> Figure:
 
 
 def make_design_page(results: DesignResults, drawings: Mapping[str, bytes]) -> Page:
-    """Return the page of a design; `drawings` holds each figure as SVG, by the names of `draw_design_figures`."""
+    """Return the page of a design; `drawings` holds each figure as SVG, by the names of `draw_design_figures`.
+
+    Sections: the result with its certificate, the front (least error by total power), the powers, a map of places if
+    one was asked for, what changes would save, and how to run the network.
+    """
     design = results.design
     sections = [_make_result_section(results), _make_front_section(drawings), _make_powers_section(results, drawings)]
     if results.map is not None:
@@ -184,7 +205,10 @@ def make_design_page(results: DesignResults, drawings: Mapping[str, bytes]) -> P
 
 
 def _make_headline(results: DesignResults) -> str:
-    """Return the title: how much less or more error and total power the design has than the network as it is."""
+    """Return the title: how much less or more error and total power the design has than the network as it is.
+
+    `results`: the design, whose `present` is the error as the network is, and the powers `before` by transmitter.
+    """
     design, power_now = results.design, sum(results.before.values())
     changes = []
     for what, designed, present in (("error", design.error, design.present), ("power", design.total, power_now)):
@@ -197,7 +221,7 @@ def _make_headline(results: DesignResults) -> str:
 def _make_result_section(results: DesignResults) -> Section:
     """Return the section on the design's error and power, beside those of the present network, and its certificate.
 
-    The certificate is a proven bound: no design has a smaller error.
+    The certificate is a proven bound: no design has a smaller error. `results`: the design, and the powers before it.
     """
     design = results.design
     keys = [
@@ -219,6 +243,7 @@ def _make_powers_section(results: DesignResults, drawings: Mapping[str, bytes]) 
     """Return the section on the powers by transmitter, before and after, and what one more watt saves at each.
 
     `slope`: by transmitter the change of the error for one unit more of its mean power, negative where that helps.
+    `results`: the design, and the powers before it. `drawings`: each figure as SVG.
     """
     after = compute_mean_powers(results.design)
     slope = results.design.sensitivity
@@ -244,7 +269,10 @@ def _make_map_section(drawings: Mapping[str, bytes]) -> Section:
 
 
 def _make_changes_section(results: DesignResults) -> Section:
-    """Return the section on what one more transmitter, relay or place would save."""
+    """Return the section on what one more transmitter, relay or place would save.
+
+    A change has a name, the error of the design made again (`value`), and by how much that is less (`saved`).
+    """
     unit = results.design.certificate.unit
     # The search finds the error to about a thousandth, so a saving is rounded to two digits of that.
     rows = [

@@ -63,6 +63,7 @@ def make_explorable_page_html(page: Page, tables: Sequence[ExploredTable]) -> st
     """Return the HTML of a page with tables to explore before its sections.
 
     It contains the tables as JSON, the program that draws them and the plotting library, so that it loads nothing else.
+    `tables`: columns by name, and which of them the first view shows; `page`: the page's title, text and sections.
     """
     data = json.dumps([asdict(table) for table in tables], ensure_ascii=False, separators=(",", ":"), allow_nan=False)
     return (

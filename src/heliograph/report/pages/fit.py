@@ -86,7 +86,9 @@ def _draw_estimates(learned: FitResults) -> Figure:
     """Draw the estimates with intervals and start values, a panel for each free number, since units differ.
 
     There is an estimate for each form of the likelihood: "linear" takes what random gains add to the variance from
-    moments before any data, "conditional" from moments given the data. The best form is drawn in blue.
+    moments before any data, "conditional" from moments given the data. The best form is drawn in blue. `rows` are the
+    lines of the table of estimates: name, estimate and interval of each free number, one table for each form.
+    `learned`: the fit, and the values at which it started.
     """
     rows = learned.fit.rows()[:MOST]
     # The best form is the last of the solutions. It is drawn at height 0, another one below it at -1.
@@ -121,7 +123,10 @@ def _draw_estimate(axes: Axes, row: Row, height: float, color: str, width: float
 
 @matplotlib.rc_context(STYLE)
 def _draw_correlations(tested: list[PredictionBeforeAndAfter]) -> Figure:
-    """Draw the correlations of innovations some rows apart, before and after learning, with 95 % intervals."""
+    """Draw the correlations of innovations some rows apart, before and after learning, with 95 % intervals.
+
+    `tested`: filters with a test of the innovations before and after, whose correlations are by lag.
+    """
     figure, grid = make_stacked_panels(len(tested), height=1.6, margin=0.7)
     for axes, change in zip(grid, tested, strict=True):
         # Bars before learning stand left of each lag, those after it right.
@@ -144,7 +149,8 @@ def _draw_correlations(tested: list[PredictionBeforeAndAfter]) -> Figure:
 def _draw_probability_transforms(received: list[HeldOutTransforms]) -> Figure:
     """Draw the histogram of each node's probability integral transforms, which are uniform if the network is right.
 
-    The grey band holds 95 % of the bars then.
+    The grey band holds 95 % of the bars then. `received`: by node the transforms of the held-out rows (`pit`), NaN
+    where nothing arrived.
     """
     figure, grid = make_stacked_panels(len(received), height=1.5, margin=0.7)
     edges = np.linspace(0, 1, BINS + 1).tolist()
@@ -163,7 +169,11 @@ def _draw_probability_transforms(received: list[HeldOutTransforms]) -> Figure:
 
 
 def make_fit_page(learned: FitResults, drawings: Mapping[str, bytes]) -> Page:
-    """Return the page of a fit; `drawings` holds each figure as SVG, by the names of `draw_fit_figures`."""
+    """Return the page of a fit; `drawings` holds each figure as SVG, by the names of `draw_fit_figures`.
+
+    `learned` has the fit, the numbers of rows that were learned from and held out, what each filter predicts of the
+    held-out rows before and after, and the laws of lost measurements by node.
+    """
     return Page(
         kicker="Heliograph fit",
         title=_make_headline(learned),
@@ -191,6 +201,8 @@ def _summarise_gain(learned: FitResults) -> str:
     """Return the page's lead: whether the first filter predicts the held-out rows better after the fit than before.
 
     It also says from which recording, and for which network. A gain is significant beyond 1.96 standard errors.
+    `learned.changes`: each filter on the held-out rows, with its `gain` of log-likelihood per row, None if there are
+    too few.
     """
     source = f"From `{visible(learned.measurements)}`, for the network `{visible(learned.network)}`."
     gains = [(change, change.gain) for change in learned.changes if change.gain is not None]
@@ -265,7 +277,10 @@ def _list_sentences(learned: FitResults) -> list[Points | Text]:
 
 
 def _make_comparison_sections(learned: FitResults, drawings: Mapping[str, bytes]) -> list[Section]:
-    """Return the sections on the held-out rows: each filter before and after, and whether the laws fit."""
+    """Return the sections on the held-out rows: each filter before and after, and whether the laws fit.
+
+    `learned`: the fit, with what filters predict of the held-out rows. `drawings`: each figure as SVG, by its name.
+    """
     if not learned.changes:
         return []
     blocks: list[Table | Picture] = [_make_changes_table(learned)]
@@ -286,7 +301,10 @@ def _make_comparison_sections(learned: FitResults, drawings: Mapping[str, bytes]
 
 
 def _make_changes_table(learned: FitResults) -> Table:
-    """Return each filter's gain of log-likelihood, and size and correlation of its innovations, before and after."""
+    """Return each filter's gain of log-likelihood, and size and correlation of its innovations, before and after.
+
+    `learned.changes`: each filter on the held-out rows, before and after the fit; a test is None with too few rows.
+    """
     rows = []
     for change in learned.changes:
         tests = [judged.test for judged in (change.before, change.after)]
@@ -306,7 +324,10 @@ def _make_changes_table(learned: FitResults) -> Table:
 
 
 def _make_losses_section(learned: FitResults) -> list[Section]:
-    """Return the section on the laws (models) of lost measurements; [] if no measurement was lost."""
+    """Return the section on the laws (models) of lost measurements; [] if no measurement was lost.
+
+    `learned.losses`: by node the fitted laws, the best one, and their gains on packets that were not fitted.
+    """
     # One row for each law of each node: its first four parameters, and gain on held-out packets.
     rows = []
     for node, losses in learned.losses.items():
@@ -326,7 +347,10 @@ def _make_losses_section(learned: FitResults) -> list[Section]:
 
 
 def _make_delays_section(learned: FitResults) -> list[Section]:
-    """Return the section on how late measurements arrived; [] unless the fit was to events with times of arrival."""
+    """Return the section on how late measurements arrived; [] unless the fit was to events with times of arrival.
+
+    `delays`: by node the probability of each delay in steps, and the seconds of a step.
+    """
     rows = [
         [visible(node), f"{steps * delays.step:g}", f"{share.estimate:.3f}", f"{share.low:.3f} to {share.high:.3f}"]
         for node, delays in learned.fit.delays.items()

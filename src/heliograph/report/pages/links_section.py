@@ -19,7 +19,10 @@ from heliograph.simulation.network import Network
 
 @matplotlib.rc_context(LOOK)
 def draw_deliveries(health: Health) -> Figure:
-    """Draw when each component arrived (blue marks) and when it was lost (orange, below), a row for each component."""
+    """Draw when each component arrived (blue marks) and when it was lost (orange, below), a row for each component.
+
+    `health`: the diagnosis of a run; a link is a received number of a node.
+    """
     links = health.links[:MOST]
     figure = Figure(figsize=(WIDTH, 0.8 + 0.28 * len(links)), layout="constrained")
     axes = figure.subplots()
@@ -74,7 +77,8 @@ def _make_link_cells(health: Health, link: Arrivals) -> list[str]:
     """Return a link's cells in the table: name, when due, share arrived, longest gap, silences, statement, values.
 
     `health.silences` holds for each node the rows in which it was silent past its timeout. The table has a column of
-    silences only if there are any.
+    silences only if there are any. `health`: the diagnosis of the run. `link`: a received number of a node, with its
+    times, values, and when it was due.
     """
     mean, deviation = _format_mean_and_deviation(link.values)
     name = visible(f"{link.node}: {link.component}")
@@ -89,7 +93,11 @@ def _make_link_cells(health: Health, link: Arrivals) -> list[str]:
 
 
 def _list_refused(health: Health) -> list[Table]:
-    """Return a table of refusals by reason: single readings by limits or filters, and whole messages; [] if none."""
+    """Return a table of refusals by reason: single readings by limits or filters, and whole messages; [] if none.
+
+    A refusal has node, filter ("" for the node's own limits), component, reason, count and first row; WORDS has words
+    for each reason. `refused_messages` counts whole messages by node and reason.
+    """
     rows = []
     names = {
         node: [link.component for link in health.links if link.node == node] for node in health.record.measurements
@@ -111,7 +119,11 @@ def _list_refused(health: Health) -> list[Table]:
 
 
 def _caption_deliveries(health: Health) -> str:
-    """Return the caption of the figure of deliveries; it explains only the marks that the figure has."""
+    """Return the caption of the figure of deliveries; it explains only the marks that the figure has.
+
+    `health`: the diagnosis of a run; a link is a received number of a node, with the mask of rows in which it arrived
+    and the times at which it was lost.
+    """
     arrived = any(link.arrived.any() for link in health.links)
     lost = any(len(link.lost_times) for link in health.links)
     if arrived and lost:

@@ -219,7 +219,10 @@ class Page:
 
 
 def make_template_environment() -> Environment:
-    """Return the environment of Jinja for this package's templates, in which all values are escaped for HTML."""
+    """Return the environment of Jinja for this package's templates, in which all values are escaped for HTML.
+
+    The filter `rich` marks up **strong** words and code; a name that a template does not get is an error.
+    """
     templates = Environment(
         loader=PackageLoader("heliograph.report.pages", "."),
         autoescape=True,

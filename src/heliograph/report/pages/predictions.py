@@ -29,7 +29,8 @@ def draw_predicted_figures(health: Health) -> dict[str, Figure]:
     """Return {file name: figure} of predictions by node and of residuals by filter; {} if there are no predictions.
 
     Each row is predicted from the rows before it; residuals are measurements minus predictions, in units of the claimed
-    deviation. At most MOST figures of each kind are drawn.
+    deviation. At most MOST figures of each kind are drawn. A file name is "predicted_i" or "residuals_i", with the
+    place of node or filter in its list.
     """
     nodes = _list_predicting_nodes(health)[:MOST]
     figures = {f"predicted_{i}": _draw_predicted(health, node) for i, node in enumerate(nodes)}
@@ -75,7 +76,11 @@ def _list_residuals(health: Health) -> "list[tuple[str, heliograph.forecasting.R
 
 
 def _make_residual_sections(health: Health, drawings: Mapping[str, bytes]) -> list[Section]:
-    """Return the section on residuals: what speaks against each filter's predictions, and their pictures."""
+    """Return the section on residuals: what speaks against each filter's predictions, and their pictures.
+
+    `_list_residuals` returns for each filter its name, "node/filter", and the tests of its residuals, whose `doubts()`
+    are sentences. `drawings`: each figure as SVG, by its name. [] without residuals.
+    """
     every = _list_residuals(health)
     pictures = {
         name: Picture(drawings[f"residuals_{i}"], f"Residuals of {visible(name)} over time and by size",
@@ -103,7 +108,10 @@ def _list_predicting_nodes(health: Health) -> list[str]:
 
 @matplotlib.rc_context(LOOK)
 def _draw_predicted(health: Health, node: str) -> Figure:
-    """Draw what filters of a node predicted of each number that arrives, with bands and the data, a panel each."""
+    """Draw what filters of a node predicted of each number that arrives, with bands and the data, a panel each.
+
+    `health`: the diagnosis of a run, with the record and the one-step predictions by node and filter.
+    """
     record, filters = health.record, health.predicted[node]
     # By filter mean and deviation of each number that arrives (rows, numbers); and the data (rows, numbers). The fusion
     # centre, which is no key of the measurements, receives the numbers of all nodes.

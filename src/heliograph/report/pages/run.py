@@ -87,7 +87,10 @@ def make_results_of_plants(examined: Mapping[str, Health], network: str) -> Resu
 
 
 def _make_overview(examined: Mapping[str, Health], network: str, folders: Mapping[str, str]) -> Page:
-    """Return the page of several plants: how many rows each has and what is doubted there, the most doubted first."""
+    """Return the page of several plants: how many rows each has and what is doubted there, the most doubted first.
+
+    `examined`: the diagnosis of each plant's run. `folders`: the folder of each plant's page.
+    """
     doubts = {plant: health.warnings() for plant, health in examined.items()}
     worst = sorted(examined, key=lambda plant: len(doubts[plant]), reverse=True)
     rows = []
@@ -107,6 +110,9 @@ def _make_overview(examined: Mapping[str, Health], network: str, folders: Mappin
 
 def run_figures(health: Health) -> dict[str, Figure]:
     """Return figures by file name: estimates of each node, innovations of each filter, deliveries of links.
+
+    `_collect_estimates` yields ("estimates" or "smoothed", the record of these); only the first nodes of a record are
+    drawn (`_choose_nodes_to_draw`), with at most as many filters as there are colours.
 
     Args:
         health: what `examine` returned: the record of all filters, and a diagnosis of links and filters.
@@ -178,6 +184,9 @@ def _draw_estimates(health: Health, record: Record, node: str) -> Figure:
 def run_page(health: Health, network: str, drawings: Mapping[str, bytes]) -> Page:
     """Return the report of a run as a page, whose `html()` is one file that needs no other.
 
+    Sections: at a glance (key figures, doubts, remarks), estimates with their errors, forecasts and predictions if
+    there are any, innovations, and links.
+
     Args:
         health: what `examine` returned.
         network: the network's name, for the title.
@@ -190,7 +199,7 @@ def run_page(health: Health, network: str, drawings: Mapping[str, bytes]) -> Pag
     instance("name of the network", network, str, "a text")
     record = health.record
     doubts = health.warnings()
-    drawings = limit_size_of_drawings(drawings, PAGE)
+    drawings = limit_size_of_drawings(drawings, PAGE)  # PAGE bytes in all; the others stay files beside the page
     rows = f"{len(record.time):,} rows, {_describe_span(record)}"
     glance = [
         _make_key_figures(health, len(doubts)),
@@ -216,7 +225,10 @@ def run_page(health: Health, network: str, drawings: Mapping[str, bytes]) -> Pag
 
 
 def _make_key_figures(health: Health, doubts: int) -> KeyFigures:
-    """Return the key figures: the number of rows, the share of due messages that arrived, and the number of doubts."""
+    """Return the key figures: the number of rows, the share of due messages that arrived, and the number of doubts.
+
+    A link's `due` is the number of messages that were due (None: unknown), and `share` the share of them that arrived.
+    """
     record = health.record
     shares = [link.share for link in health.links if link.due is not None]
     arrived = f"{np.mean(shares):.1%}" if shares else "–"
@@ -234,6 +246,7 @@ def limit_size_of_drawings(drawings: Mapping[str, bytes], limit: int) -> dict[st
     """Return the drawings that together have at most `limit` bytes, those named in FIRST before others.
 
     A drawing that does not fit is left out, and smaller ones after it may fit. As text in a page they take 4/3 of this.
+    FIRST has the names of the figures that matter most, such as "links".
     """
     fitting, total = dict[str, bytes](), 0
     for name in sorted(drawings, key=lambda name: name in FIRST, reverse=True):

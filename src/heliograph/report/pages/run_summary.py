@@ -52,7 +52,10 @@ def run_summary(health: Health) -> dict[str, Json]:
 
 
 def _list_refused(health: Health) -> list[Json]:
-    """Return what arrived and was refused, with reasons and counts: values by component, then messages by node."""
+    """Return what arrived and was refused, with reasons and counts: values by component, then messages by node.
+
+    `health`: the diagnosis of a run.
+    """
     readings: list[Json] = [dict(vars(refusal)) for refusal in health.record.refusals]
     return readings + [
         {"node": node, "reason": reason, "count": count}
@@ -65,7 +68,9 @@ def _list_filter_numbers(tested: FilterHealth) -> dict[str, Json]:
     """Return the numbers on one filter by name: its claim, and tests of its innovations.
 
     size: mean of innovation^2 / variance, 1 if the covariance holds. correlation: of successive innovations. declared:
-    tests of noise variances that are reported with messages, one for each class of messages.
+    tests of noise variances that are reported with messages, one for each class of messages. `test` is None with too
+    few rows or without a claim; `power` is the size, and the correlation is by lag, lag 1 first. `tested`: the filter
+    with the tests of its innovations.
     """
     numbers: dict[str, Json] = {"claim": tested.claim}
     if tested.test is not None:
@@ -83,7 +88,10 @@ def _list_filter_numbers(tested: FilterHealth) -> dict[str, Json]:
 
 
 def _list_error_numbers(record: Record) -> dict[str, dict[str, Json]]:
-    """Return {node: {filter: its RMSE by state, and its NEES}}, or {} if the truth is not known."""
+    """Return {node: {filter: its RMSE by state, and its NEES}}, or {} if the truth is not known.
+
+    `record`: the estimates of a run, with true states if they are known.
+    """
     errors: dict[str, dict[str, Json]] = {}
     for of_filter in compute_filter_errors(record):
         nees = None if np.isnan(of_filter.nees) else of_filter.nees
@@ -100,7 +108,8 @@ def _list_overload_numbers(probability: np.ndarray, bound: np.ndarray) -> dict[s
 def _list_link_numbers(link: Arrivals) -> dict[str, Json]:
     """Return numbers on a component's messages: the share that arrived, the longest gap, and when they are due.
 
-    `period` and `due` are there only if the sender is slower than the rows, or is due in a pattern of rows.
+    `period` and `due` are there only if the sender is slower than the rows, or is due in a pattern of rows. `link`: a
+    received number of a node, with its times, and when it was due (`due` None if unknown).
     """
     numbers: dict[str, Json] = {"arrived": None if link.due is None else link.share, "longest_gap": link.longest_gap}
     if link.period is not None:

@@ -42,7 +42,9 @@ def draw_worth(worth: SensorWorth, title: str) -> Figure:
 def _draw_bars_of_state(axes: Axes, worth: SensorWorth, i: int, limits: tuple[float, float]) -> None:
     """Draw a bar for each case, the first one above: the error of state i over that with all nodes.
 
-    Beside each bar stands its number, and if errors were drawn its standard error. `limits`: ends of the axis.
+    Beside each bar stands its number, and if errors were drawn its standard error. `limits`: ends of the axis. A case
+    is the network with a node left out, out for a while, or added. `case.increase` (states,) is its error over that
+    with all nodes (`worth.complete.error`), and `case.uncertainty` the standard error of its error.
     """
     increase = np.array([case.increase[i] for case in worth.cases])
     lengths = np.where(np.isfinite(increase) & (increase > 0), increase, 1.0)  # no bar where it is not known
@@ -79,6 +81,7 @@ def _find_limits(worth: SensorWorth) -> tuple[float, float]:
     """Return the ends of all panels' axes, a little beyond the bars and with room for their numbers.
 
     A bar goes from 1 to the factor `increase`. SPARE and ROOM are shares of the bars' span, in logarithms.
+    `worth.cases`: the network with a node left out, out for a while, or added.
     """
     increases = np.array([case.increase for case in worth.cases])
     ends_of_bars = np.append(increases[np.isfinite(increases) & (increases > 0)], 1.0)

@@ -262,10 +262,11 @@ def _classify_rows(
 ) -> tuple[DeclaredRows, Int[np.ndarray, " steps"]]:
     """Divide the rows with messages of a link into classes by the mean logarithm of the variances that they declare.
 
-    `link`: its number among the links that report numbers with each message. `z`, `u`: measurements and inputs.
+    `link`: its number among the links of `filter` that report variances with each message. `z`, `u`: the recording.
 
     Returns:
-        The recording with the edges of the classes, and the class of each row, -1 of a row that is not used.
+        `DeclaredRows`, the recording with the edges between classes (log-variances) and the usual declared deviation of
+        each output; and the class of each row, -1 of a row that is not used.
     """
     z, columns = z.copy(), find_link_columns(filter, link)
     with np.errstate(all="ignore"):
@@ -276,7 +277,7 @@ def _classify_rows(
             z[~valid & np.isin(np.arange(z.shape[1]), declaring.values + declaring.numbers)] = np.nan
         variances = _compute_declared_variances(columns, z)
         log_size = np.mean(np.log(variances), axis=1)
-    # Rows in which the link reported a variance and a value came.
+    # Rows in which the link reported a variance and one of its values (`columns.values` of z) came.
     heard = ~np.isnan(log_size) & ~np.isnan(z[:, columns.values]).all(axis=1)
     # Edges at quantiles, so that each class has as many rows, and at least EACH numbers.
     sizes, numbers = log_size[heard], int(np.count_nonzero(~np.isnan(z[heard][:, columns.values])))
@@ -330,10 +331,9 @@ def _make_judgement(
 ) -> DeclaredJudgement:
     """Return the judgement of a link from the tests of its innovations (`tested`), before and after the refit.
 
-    A class has messages that declare similar variances of their noise; the refit scales the variances of each class.
-    `declared`: the filter and the recording. `classes`: class of each row, -1 of a row that is not used. `scales`: of
-    each class, with the lower and the upper ends of their intervals, (classes,) each. `bias`: a slow error that
-    explains the innovations where no scale does; None if there is none.
+    A class has messages that declare similar variances, which the refit scales. `declared`: filter and recording.
+    `classes`: class of each row, -1 of unused ones. `scales`: of each class, with the lower and the upper ends of
+    their intervals, (classes,) each. `bias`: a slow error that explains innovations where no scale does, or None.
     """
     before, after = tested
     columns, judged_classes = declared.columns, []

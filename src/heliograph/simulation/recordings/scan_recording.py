@@ -201,6 +201,9 @@ def _scan_in_parts(task: FilteringTask, z: tuple[np.ndarray, ...], judged: bool)
     It serves networks whose fusions between neighbours native code cannot compile. There each node weighs its
     neighbours' messages; weights that depend only on which messages arrive are computed for the rows of a part at once.
 
+    Returns a tree of arrays with a leading axis of rows, as `_collect_results` makes it of the filters' last states and
+    of all rows' outputs.
+
     Args:
         task: the filters, the smoother or None, inputs (steps, inputs), and which messages arrive, by fusion. The rows
             begin the recording: the filters start from their initial states.
@@ -209,7 +212,7 @@ def _scan_in_parts(task: FilteringTask, z: tuple[np.ndarray, ...], judged: bool)
     """
     filters, smoother, u, arrivals, _ = task
     # As few parts of at most ROWS rows as there can be, of one size, so that they share a program.
-    count = -(-len(u) // ROWS)
+    count = -(-len(u) // ROWS)  # -(-a // b) is a / b, rounded up
     size = -(-len(u) // count)
     rows, states, parts = (np.arange(len(u)), u, z, arrivals), initial_states(filters), []
     for start in range(0, len(u), size):
@@ -222,6 +225,7 @@ def _scan_in_parts(task: FilteringTask, z: tuple[np.ndarray, ...], judged: bool)
             for name, mesh in filters.meshes.items()
         }
         is_counted = np.arange(start, start + size) < len(u)
+        # The filters' states go on from part to part; rows that only fill up the last part change nothing.
         states, results = _part_by_xla(filters, states, (k, u_k, z_k, arrivals_k), judged, is_counted)
         parts.append(to_numpy(results))
     all_rows = jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(u)], *parts)
