@@ -9,8 +9,6 @@ from http.client import HTTPConnection
 from pathlib import Path
 from urllib.parse import urlencode
 
-from heliograph_studies.live.server import free_port
-
 SECONDS = 60  # until a server that starts must answer
 CONFIGURATION = """
 reporting-disabled = true
@@ -38,6 +36,8 @@ class Influx:
     """A server with one database, `plant`, in a folder that goes with it; use it in a `with`."""
 
     def __init__(self) -> None:
+        from heliograph_studies.live.server import free_port  # brings JAX, which reads its settings when imported
+
         self.folder, self.port = Path(tempfile.mkdtemp(prefix="heliograph-influx-")), free_port()
         configuration = self.folder / "influxdb.conf"
         configuration.write_text(CONFIGURATION.format(folder=self.folder, port=self.port, rpc=free_port()))

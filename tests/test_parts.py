@@ -1,5 +1,7 @@
 """Which real parts ran is said, and a missing one is skipped with the command that installs it."""
 
+import subprocess
+import sys
 from types import SimpleNamespace
 
 import pytest
@@ -50,3 +52,9 @@ def test_what_another_process_started_counts_and_the_last_line_names_every_part(
         "rattler-build left out",
         "browser skipped (apt-get install chromium)",
     ]
+
+
+def test_the_settings_of_the_tests_come_before_what_reads_them():
+    """JAX and SciPy's BLAS read them once, when imported: with JAX in `conftest`, a process compiled as for use."""
+    code = "import sys, tests.conftest; sys.exit(sorted({'jax', 'scipy', 'heliograph'} & set(sys.modules)) or None)"
+    subprocess.run([sys.executable, "-c", code], check=True)
